@@ -1,0 +1,1 @@
+"""The words that client, server and worker share. Pydantic only."""

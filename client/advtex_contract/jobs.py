@@ -1,0 +1,130 @@
+"""Jobs as client, server and worker speak of them."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+from advtex_contract.errors import ErrorDetail
+from advtex_contract.options import JobOptions
+
+Label = Annotated[str, StringConstraints(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
+
+
+class JobState(StrEnum):
+    """`uploading` and `queued` wait, `running` and `preempted` are being worked on, the rest are final."""
+
+    uploading = "uploading"
+    queued = "queued"
+    running = "running"
+    preempted = "preempted"
+    succeeded = "succeeded"
+    failed = "failed"
+    canceled = "canceled"
+    rejected = "rejected"
+
+
+TERMINAL = frozenset({JobState.succeeded, JobState.failed, JobState.canceled, JobState.rejected})
+
+
+class JobSpec(BaseModel):
+    """Body of `POST /v1/jobs`: texture the scan of a finished upload."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    upload_id: str
+    options: JobOptions = JobOptions()
+    label: Label = ""
+
+
+class Progress(BaseModel):
+    """Where a running job stands. `losses` holds the newest values by name; times are seconds."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    stage: str = ""
+    step: int = 0
+    steps: int = 0
+    losses: dict[str, float] = Field(default_factory=dict)
+    stage_seconds: dict[str, float] = Field(default_factory=dict)
+    eta_seconds: float | None = None
+
+
+class ResultFile(BaseModel):
+    """A file of a finished job, downloadable at `url` (path on the same server) with Range requests."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: str
+    size: int
+    sha256: str
+    content_type: str
+    url: str
+
+
+class JobError(BaseModel):
+    """Why a job failed or was rejected, in words, with the remedy and the log's tail."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    code: str
+    message: str
+    details: list[ErrorDetail] = Field(default_factory=list)
+    log_tail: str = ""
+
+
+class JobView(BaseModel):
+    """A job as the API shows it. `attempt` counts from 1; it is 0 until a worker first takes the job."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    id: str
+    state: JobState
+    label: str = ""
+    upload_id: str
+    options: JobOptions
+    attempt: int = 0
+    progress: Progress = Progress()
+    warnings: list[ErrorDetail] = Field(default_factory=list)
+    error: JobError | None = None
+    results: list[ResultFile] = Field(default_factory=list)
+    created_at: datetime
+    updated_at: datetime
+    finished_at: datetime | None = None
+    expires_at: datetime | None = None
+
+
+class JobPage(BaseModel):
+    """A page of jobs, newest first; `next_cursor` is null on the last one."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    jobs: list[JobView]
+    next_cursor: str | None = None
+
+
+class UploadView(BaseModel):
+    """An upload: complete once `offset == size` and its sha256 is known."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    id: str
+    size: int
+    offset: int
+    complete: bool
+    sha256: str | None = None
+    filename: str = ""
+    created_at: datetime
+    expires_at: datetime | None = None
+
+
+class StorageInfo(BaseModel):
+    """What the server accepts at most, and how long it keeps things (seconds)."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    max_upload_bytes: int
+    retention_seconds: int

@@ -1,0 +1,1 @@
+"""One module per accepted layout; each turns files into a ScanManifest."""

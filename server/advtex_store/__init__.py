@@ -1,0 +1,1 @@
+"""What server and worker both remember: job rows, blobs and the queue."""

@@ -1,0 +1,1 @@
+"""Texture optimization: torch, usable alone, knows no HTTP and no queue."""

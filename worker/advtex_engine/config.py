@@ -1,0 +1,102 @@
+"""Every number of the method, named once.
+
+Preset      the paper's symbols beside ours: steps, start, lr_texture, lr_discriminator, l1_weight (lambda), l1_decay
+TextureConfig   what one run is asked to do
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from advtex_engine.errors import OptionError
+
+
+@dataclass(frozen=True)
+class PyramidLevel:
+    """`steps` at 1/scale of the working size and of the texture's size."""
+
+    steps: int
+    scale: int = 1
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Hyper-parameters of the optimization (paper sections 3.2 and 4; supplement "Training").
+
+    levels            coarse-to-fine schedule; one level for everything but `preview`
+    start             "zero" (paper) or "mean" (texture starts as the projected average)
+    lr_texture        1e-3, Adam
+    lr_discriminator  1e-4, Adam
+    beta1             0.5
+    l1_weight         lambda = 10 at the start
+    l1_decay          lambda is multiplied by this `l1_decays` times over the whole run (paper: 0.8 every 1,000 of 50,000)
+    max_pair_angle    largest angle between the optical axes of a pair, degrees (released code: 15)
+    min_pair_overlap  least share of the source's foreground that the auxiliary view sees
+    """
+
+    levels: tuple[PyramidLevel, ...]
+    start: Literal["zero", "mean"]
+    lr_texture: float = 1e-3
+    lr_discriminator: float = 1e-4
+    beta1: float = 0.5
+    l1_weight: float = 10.0
+    l1_decay: float = 0.8
+    l1_decays: float = 50.0
+    max_pair_angle: float = 15.0
+    min_pair_overlap: float = 0.3
+
+    @property
+    def steps(self) -> int:
+        """Optimiser iterations over all levels."""
+        return sum(level.steps for level in self.levels)
+
+
+PRESETS: dict[str, Preset] = {
+    "paper": Preset(levels=(PyramidLevel(50_000),), start="zero"),
+    "full": Preset(levels=(PyramidLevel(50_000),), start="mean"),
+    "standard": Preset(levels=(PyramidLevel(4_000),), start="mean"),
+    "preview": Preset(levels=(PyramidLevel(1_500, scale=2), PyramidLevel(400)), start="mean"),
+}
+METHODS = ("adversarial", "average")
+
+
+@dataclass(frozen=True)
+class TextureConfig:
+    """What one run is asked to do.
+
+    preset            a name of PRESETS, or "auto": full on a GPU, standard on a CPU
+    size              working size (width, height) of the views in pixels; None keeps the scan's
+    holdout           N leaves out of every stage the sorted frames whose position % N == N // 2
+    steps             overrides the preset's step count, its levels scaled in proportion
+    face_budget       the mesh is decimated to at most this many faces
+    max_texture_size  cap on the texture's side in texels
+    """
+
+    preset: str = "auto"
+    method: str = "adversarial"
+    size: tuple[int, int] | None = None
+    holdout: int | None = None
+    steps: int | None = None
+    face_budget: int = 80_000
+    max_texture_size: int = 4096
+    texels_per_pixel: float = 1.2
+    device: str = "auto"
+    seed: int = 0
+    checkpoint_seconds: float = 30.0
+
+    def __post_init__(self) -> None:
+        if self.preset != "auto" and self.preset not in PRESETS:
+            raise OptionError(f"preset {self.preset!r} is unknown; choose one of auto, {', '.join(PRESETS)}")
+        if self.method not in METHODS:
+            raise OptionError(f"method {self.method!r} is unknown; choose one of {', '.join(METHODS)}")
+        if self.size is not None and not all(64 <= side <= 4096 for side in self.size):
+            raise OptionError(f"size {self.size[0]}x{self.size[1]} is out of bounds; each side takes 64 to 4096 pixels")
+        if self.holdout is not None and self.holdout < 2:
+            raise OptionError(f"holdout {self.holdout} is out of bounds; 2 or more leaves every Nth frame out")
+        if self.steps is not None and self.steps < 1:
+            raise OptionError(f"steps {self.steps} is out of bounds; at least 1 is needed")
+        if self.face_budget < 100:
+            raise OptionError(f"face budget {self.face_budget} is out of bounds; at least 100 faces are needed")
+        if not 256 <= self.max_texture_size <= 16384:
+            raise OptionError(f"max texture size {self.max_texture_size} is out of bounds; it takes 256 to 16384 texels")

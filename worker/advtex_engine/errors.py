@@ -1,0 +1,41 @@
+"""Engine errors.
+
+EngineError
+├── ScanError       the scan cannot be textured; `findings` say what and how to mend it
+├── OptionError     an option is out of bounds or unknown
+└── Stopped         a stop was asked for; a checkpoint is on disk
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+class EngineError(Exception):
+    """Base of all errors that the engine raises on purpose. The message names the input and the remedy."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing that is wrong with a scan."""
+
+    code: str
+    where: str
+    message: str
+    remedy: str
+
+
+class ScanError(EngineError):
+    """The scan cannot be textured."""
+
+    def __init__(self, *problems: Problem) -> None:
+        super().__init__("; ".join(f"{p.where}: {p.message} ({p.remedy})" for p in problems))
+        self.problems = problems
+
+
+class OptionError(EngineError):
+    """An option is out of bounds or unknown."""
+
+
+class Stopped(EngineError):
+    """The run was asked to stop and has written its checkpoint."""

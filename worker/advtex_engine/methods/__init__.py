@@ -1,0 +1,1 @@
+"""One module per texturing method, behind one signature."""

@@ -1,0 +1,284 @@
+"""The parameterization: uv of the scan if they can be textured, else charts from xatlas, and the texture's size."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+import xatlas
+from torch import Tensor
+
+from advtex_engine.config import TextureConfig
+from advtex_engine.density import face_areas, pixel_density
+from advtex_engine.errors import Problem, ScanError
+from advtex_engine.monitor import Monitor
+from advtex_engine.scene import Atlas, Camera, Mesh
+
+Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+
+# The texture's sides are multiples of this, so that coarse levels of a pyramid divide them.
+SIZE_STEP = 64
+MIN_SIZE = 256
+# Texels kept free around each chart: bilinear sampling touches one, and half-size pyramid levels halve what is left.
+PADDING = 4
+# xatlas merges faces into a chart up to this cost; its default of 2 makes twice the charts in a third more time.
+CHART_COST = 8.0
+# Texel density of what no camera sees, and the least of what one does, relative to the scan's mean density.
+UNSEEN_DENSITY = 0.05
+# Each round of packing shrinks the charts by what they overshot the cap, and a little more.
+PACKING_ROUNDS = 8
+SHRINK_MARGIN = 0.99
+
+# A scan's own uv are kept if, measured at UV_TEST_SIZE:
+UV_TEST_SIZE = 1024
+MAX_OVERLAP = 0.02  # share of the covered texels that two faces claim
+MAX_OUTSIDE = 0.001  # share of the surface whose uv leave [0, 1]
+MAX_COLLAPSED = 0.02  # share of the surface whose uv triangles have no area
+MIN_USED = 0.1  # share of the texture that is covered at all
+
+
+def build_atlas(mesh: Mesh, cameras: Sequence[Camera], config: TextureConfig, monitor: Monitor) -> Atlas:
+    """Give every face its own texels: about config.texels_per_pixel per pixel (along an edge) where it is seen best.
+
+    mesh: cleaned. cameras: those of the views, at the working size. The texture is square, its side a multiple of
+    SIZE_STEP and at most config.max_texture_size. Same input, same atlas. Not differentiable.
+    """
+    wanted = _wanted_texels(mesh, cameras, config.texels_per_pixel)
+    if mesh.v_uv is not None:
+        reason = why_not_kept(mesh)
+        if reason is None:
+            return _keep_uv(mesh, wanted, config)
+        monitor.warning(
+            Problem(
+                "uv_replaced",
+                "mesh",
+                f"the mesh's texture coordinates are not kept: {reason}",
+                "none needed; upload a mesh whose uv do not overlap to keep them",
+            )
+        )
+    return _new_atlas(mesh, wanted, config)
+
+
+def _wanted_texels(mesh: Mesh, cameras: Sequence[Camera], texels_per_pixel: float) -> Floats:
+    """[T] area of each face in texels; what is barely seen gets UNSEEN_DENSITY of the mean."""
+    density, area = pixel_density(mesh, cameras).double(), face_areas(mesh)
+    if not (density > 0).any():
+        raise ScanError(
+            Problem(
+                "mesh_not_seen", "mesh", "no frame sees the mesh", "check that poses and mesh share one world frame"
+            )
+        )
+    mean = (density * area).sum() / area[density > 0].sum()
+    texels: Floats = (texels_per_pixel**2 * area * density.clamp(min=float(UNSEEN_DENSITY * mean))).numpy()
+    return texels
+
+
+# The scan's own uv ----------------------------------------------------------------------------------------------------
+
+
+def why_not_kept(mesh: Mesh) -> str | None:
+    """What keeps the mesh's uv from being textured, in words; None if they are injective enough."""
+    corners, area = _uv_corners(mesh), face_areas(mesh).numpy()
+    outside = area[((corners < 0) | (corners > 1) | ~np.isfinite(corners)).any(axis=(1, 2))].sum() / area.sum()
+    if outside > MAX_OUTSIDE:
+        return f"those of {outside:.1%} of the surface lie outside [0, 1]"
+    uv_area = _uv_areas(corners)
+    collapsed = area[uv_area <= 1e-12].sum() / area.sum()
+    if collapsed > MAX_COLLAPSED:
+        return f"those of {collapsed:.1%} of the surface have no area"
+    counts = _coverage(corners * UV_TEST_SIZE, UV_TEST_SIZE, UV_TEST_SIZE, reach=0.0)
+    used = (counts > 0).mean()
+    overlap = (counts > 1).sum() / max((counts > 0).sum(), 1)
+    if overlap > MAX_OVERLAP:
+        return f"{overlap:.1%} of the texture they use is claimed by more than one face"
+    if used < MIN_USED:
+        return f"they use only {used:.1%} of the texture"
+    return None
+
+
+def _keep_uv(mesh: Mesh, wanted: Floats, config: TextureConfig) -> Atlas:
+    side = math.sqrt(wanted.sum() / _uv_areas(_uv_corners(mesh)).sum())
+    size = min(_round_up(side), _cap(config))
+    assert mesh.t_uv_idx is not None
+    return Atlas(mesh, size, size, "scan", _count_islands(mesh.t_uv_idx.numpy()))
+
+
+def _count_islands(t_uv_idx: Integers) -> int:
+    """Connected pieces in uv: faces that share a uv index."""
+    label = np.arange(int(t_uv_idx.max()) + 1)
+    while True:
+        least = label[t_uv_idx].min(axis=1)
+        new = label.copy()
+        np.minimum.at(new, t_uv_idx.reshape(-1), np.repeat(least, 3))
+        new = new[new]
+        if np.array_equal(new, label):
+            return len(np.unique(label[t_uv_idx]))
+        label = new
+
+
+# New charts -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Charts:
+    """uv [U,2] in chart-local units, face indices into it [T,3], chart of each face [T] (-1 = none)."""
+
+    uv: Floats
+    faces: Integers
+    chart: Integers
+
+
+def _new_atlas(mesh: Mesh, wanted: Floats, config: TextureConfig) -> Atlas:
+    charts = _make_charts(mesh)
+    charts = replace(charts, uv=_scale_charts(charts, wanted))
+    cap = _cap(config)
+    for _ in range(PACKING_ROUNDS):
+        texel, side = _pack(charts)
+        if _round_up(side) <= cap:
+            size = _round_up(side)
+            packed = replace(
+                mesh,
+                v_uv=torch.from_numpy((texel / size).astype(np.float32)),
+                t_uv_idx=torch.from_numpy(charts.faces),
+            )
+            return Atlas(packed, size, size, "xatlas", int(charts.chart.max()) + 1)
+        charts = replace(charts, uv=charts.uv * (cap / side * SHRINK_MARGIN))
+    raise ScanError(
+        Problem(
+            "atlas_too_large",
+            "mesh",
+            f"the mesh's {charts.chart.max() + 1:,} charts do not fit a texture of {cap} texels",
+            "raise the texture's maximal size, or simplify the mesh and remove its small loose pieces",
+        )
+    )
+
+
+def _make_charts(mesh: Mesh) -> _Charts:
+    """Cut the mesh into charts (xatlas) and flatten them. Faces and their corners keep their order."""
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(mesh.v_pos.numpy(), mesh.t_pos_idx.numpy().astype(np.uint32))
+    options = xatlas.ChartOptions()
+    options.max_cost = CHART_COST
+    atlas.generate(options, _pack_options())
+    _, faces, uv = atlas[0]
+    chart = np.full(len(faces), -1, dtype=np.int64)
+    for index in range(atlas.chart_count):
+        chart[np.asarray(atlas.get_mesh_chart(0, index).faces)] = index
+    return _Charts(uv * np.array([atlas.width, atlas.height], dtype=np.float64), faces.astype(np.int64), chart)
+
+
+def _scale_charts(charts: _Charts, wanted: Floats) -> Floats:
+    """uv in texels: each chart as large as its faces want to be together."""
+    count = int(charts.chart.max()) + 1
+    placed = charts.chart >= 0
+    have = np.bincount(charts.chart[placed], _uv_areas(charts.uv[charts.faces])[placed], count)
+    want = np.bincount(charts.chart[placed], wanted[placed], count)
+    scale = np.sqrt(want / np.maximum(have, 1e-12))
+    per_vertex = np.ones(len(charts.uv))
+    per_vertex[charts.faces[placed]] = scale[charts.chart[placed], None]
+    return charts.uv * per_vertex[:, None]
+
+
+def _pack(charts: _Charts) -> tuple[Floats, int]:
+    """Place the charts at their scale: texel coordinates [U,2] and the side that holds them."""
+    atlas = xatlas.Atlas()
+    atlas.add_uv_mesh(charts.uv.astype(np.float32), charts.faces.astype(np.uint32))
+    atlas.generate(xatlas.ChartOptions(), _pack_options(texels_per_unit=1.0))
+    mapping, faces, uv = atlas[0]
+    assert atlas.atlas_count == 1
+    assert np.array_equal(mapping[faces], charts.faces)
+    texel = np.zeros_like(charts.uv)
+    texel[mapping] = uv * np.array([atlas.width, atlas.height], dtype=np.float64)
+    return texel, max(atlas.width, atlas.height)
+
+
+def _pack_options(texels_per_unit: float = 0.0) -> Any:
+    """Random placement: brute force takes minutes. Block alignment packs faster at the same efficiency.
+
+    xatlas's `resolution` is no cap, so none is given.
+    """
+    options = xatlas.PackOptions()
+    options.padding = PADDING
+    options.bilinear = True
+    options.blockAlign = True
+    options.bruteForce = False
+    options.create_image = False
+    options.texels_per_unit = texels_per_unit
+    return options
+
+
+def _round_up(side: float) -> int:
+    return max(MIN_SIZE, math.ceil(side / SIZE_STEP) * SIZE_STEP)
+
+
+def _cap(config: TextureConfig) -> int:
+    return config.max_texture_size // SIZE_STEP * SIZE_STEP
+
+
+# Texture space --------------------------------------------------------------------------------------------------------
+
+
+def covered_texels(atlas: Atlas) -> Tensor:
+    """[H,W] bool: every texel that bilinear sampling may touch at any point of the surface.
+
+    A sample touches the texels whose centers are less than one texel away along both axes, so a texel counts if the
+    2x2 square around its center meets a uv triangle.
+    """
+    corners = _uv_corners(atlas.mesh) * np.array([atlas.width, atlas.height])
+    return torch.from_numpy(_coverage(corners, atlas.width, atlas.height, reach=1.0) > 0)
+
+
+def _uv_corners(mesh: Mesh) -> Floats:
+    """[T,3,2] uv of each face's corners."""
+    assert mesh.v_uv is not None
+    assert mesh.t_uv_idx is not None
+    corners: Floats = mesh.v_uv.double()[mesh.t_uv_idx].numpy()
+    return corners
+
+
+def _uv_areas(corners: Floats) -> Floats:
+    """[T] areas of triangles [T,3,2]."""
+    edge = corners[:, 1:] - corners[:, :1]
+    area: Floats = np.abs(edge[:, 0, 0] * edge[:, 1, 1] - edge[:, 0, 1] * edge[:, 1, 0]) / 2
+    return area
+
+
+def _coverage(corners: Floats, width: int, height: int, reach: float) -> npt.NDArray[np.int32]:
+    """[H,W] how many triangles [T,3,2] (texels) meet the square of half-side `reach` around each texel's center.
+
+    reach 0 counts centers. For each triangle and row the columns form one interval: an edge with inward normal n
+    admits the square around c while n . c + reach (|nx| + |ny|) >= n . edge, and the bounding box caps the rest
+    (separating axes). Intervals are summed as +1 at their start and -1 after their end.
+    """
+    corners = corners[_uv_areas(corners) > 0]
+    low, high = corners.min(axis=1) - reach, corners.max(axis=1) + reach
+    first = np.clip(np.ceil(low[:, 1] - 0.5), 0, height).astype(np.int64)
+    rows = np.maximum(np.clip(np.ceil(high[:, 1] - 0.5), 0, height).astype(np.int64) - first, 0)
+    triangle = np.repeat(np.arange(len(corners)), rows)
+    row = np.arange(len(triangle)) - np.repeat(np.cumsum(rows) - rows, rows) + np.repeat(first, rows)
+    left, right = low[triangle, 0], high[triangle, 0]
+    turn = np.sign(np.linalg.det(corners[:, 1:] - corners[:, :1]))
+    for k in range(3):
+        start, edge = corners[:, k], corners[:, (k + 1) % 3] - corners[:, k]
+        normal = np.stack([-edge[:, 1], edge[:, 0]], axis=1) * turn[:, None]
+        offset = (normal * start).sum(axis=1) - reach * np.abs(normal).sum(axis=1)
+        nx, rest = normal[triangle, 0], offset[triangle] - normal[triangle, 1] * (row + 0.5)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            bound = rest / nx
+        left = np.where(nx > 0, np.maximum(left, bound), left)
+        right = np.where(nx < 0, np.minimum(right, bound), right)
+        right = np.where((nx == 0) & (rest > 0), -np.inf, right)
+    start_column = np.clip(np.ceil(left - 0.5), 0, width).astype(np.int64)
+    end_column = np.clip(np.ceil(right - 0.5), 0, width).astype(np.int64)
+    filled = end_column > start_column
+    steps = np.zeros((height, width + 1), dtype=np.int32)
+    np.add.at(steps, (row[filled], start_column[filled]), 1)
+    np.add.at(steps, (row[filled], end_column[filled]), -1)
+    counts: npt.NDArray[np.int32] = steps.cumsum(axis=1, dtype=np.int32)[:, :width]
+    return counts

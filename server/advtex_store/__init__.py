@@ -1,1 +1,1 @@
-"""What server and worker both remember: job rows, blobs and the queue."""
+"""What server and worker both remember: rows (the truth), blobs (the bytes) and the queue (transport only)."""

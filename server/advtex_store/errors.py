@@ -1,0 +1,45 @@
+"""Errors of the store.
+
+StoreError
+├── RecordNotFound        no such object, or it belongs to somebody else
+├── IllegalTransition     the job's state does not allow it
+├── StaleAttempt          the attempt is no longer the job's current one: stop, write nothing more
+├── IdempotencyMismatch   the same key came with another body
+├── IdempotencyInFlight   the same key is being worked on right now
+├── BlobNotFound
+└── NoSpace               the disk is full; nothing was kept
+"""
+
+from __future__ import annotations
+
+
+class StoreError(Exception):
+    """Base of all errors that the store raises on purpose."""
+
+
+class RecordNotFound(StoreError):
+    """No such object for this owner."""
+
+
+class IllegalTransition(StoreError):
+    """The job's state does not allow what was asked."""
+
+
+class StaleAttempt(StoreError):
+    """The attempt lost its job to a later one, or the job has ended: stop, and write nothing more."""
+
+
+class IdempotencyMismatch(StoreError):
+    """The idempotency key was used before with another body."""
+
+
+class IdempotencyInFlight(StoreError):
+    """A request with this idempotency key has not been answered yet."""
+
+
+class BlobNotFound(StoreError):
+    """No blob has this key."""
+
+
+class NoSpace(StoreError):
+    """The disk is full; the partial file was removed."""

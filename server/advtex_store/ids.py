@@ -1,0 +1,10 @@
+"""Identifiers: lower-case hexadecimal, sorted by time of creation, with 64 random bits."""
+
+from __future__ import annotations
+
+import secrets
+
+
+def new_id(now: float) -> str:
+    """28 characters: 12 of milliseconds since 1970, 16 random. Fit for URLs, file names and RQ job ids."""
+    return f"{int(now * 1000):012x}{secrets.token_hex(8)}"

@@ -1,0 +1,13 @@
+"""Run by alembic inside the transaction that `upgrade_database` opened."""
+
+from __future__ import annotations
+
+from alembic import context
+
+from advtex_store.models import Base
+
+context.configure(
+    connection=context.config.attributes["connection"], target_metadata=Base.metadata, render_as_batch=True
+)
+with context.begin_transaction():
+    context.run_migrations()

@@ -1,0 +1,109 @@
+"""The tables. Times are seconds since 1970 on the database's clock (`Database.now`)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import JSON, BigInteger, Double, ForeignKey, Index, String, Text
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+
+class Base(DeclarativeBase):
+    type_annotation_map = {str: String(255), float: Double(), dict[str, Any]: JSON(), list[Any]: JSON()}  # noqa: RUF012
+
+
+class ApiKeyRow(Base):
+    """`owner` is what objects belong to, so that a key can be replaced without losing them."""
+
+    __tablename__ = "api_keys"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    owner: Mapped[str] = mapped_column(index=True)
+    name: Mapped[str] = mapped_column(default="")
+    secret_sha256: Mapped[str]
+    scopes: Mapped[list[Any]]
+    created_at: Mapped[float]
+    expires_at: Mapped[float | None]
+    revoked_at: Mapped[float | None]
+
+
+class UploadRow(Base):
+    """A scan on its way in; complete once `sha256` is set, and only then its blob exists."""
+
+    __tablename__ = "uploads"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    owner: Mapped[str] = mapped_column(index=True)
+    filename: Mapped[str] = mapped_column(default="")
+    size: Mapped[int] = mapped_column(BigInteger)
+    offset: Mapped[int] = mapped_column(BigInteger, default=0)
+    sha256: Mapped[str | None]
+    created_at: Mapped[float]
+    expires_at: Mapped[float | None] = mapped_column(index=True)
+    deleted_at: Mapped[float | None]
+    purged_at: Mapped[float | None]
+
+
+class JobRow(Base):
+    """A job. A row in state `queued` or `preempted` is also its own outbox entry: the dispatcher reads it.
+
+    attempt: the number that runs now, or will run next while the job waits, or ran last; the fence of all that a worker
+        writes.
+    version: grows by one with every change that a user can see; the ids of `EventRow`.
+    reached, reached_at_claim, deaths: how far any attempt got, where this one began, and how many attempts in a row
+    died without getting farther.
+    """
+
+    __tablename__ = "jobs"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    owner: Mapped[str]
+    upload_id: Mapped[str] = mapped_column(ForeignKey("uploads.id"), index=True)
+    state: Mapped[str] = mapped_column(String(16))
+    label: Mapped[str] = mapped_column(default="")
+    options: Mapped[dict[str, Any]]
+    attempt: Mapped[int] = mapped_column(default=1)
+    worker: Mapped[str | None]
+    lease_expires_at: Mapped[float | None]
+    cancel_requested: Mapped[bool] = mapped_column(default=False)
+    reached: Mapped[int] = mapped_column(BigInteger, default=0)
+    reached_at_claim: Mapped[int] = mapped_column(BigInteger, default=0)
+    deaths: Mapped[int] = mapped_column(default=0)
+    log_tail: Mapped[str] = mapped_column(Text, default="")
+    progress: Mapped[dict[str, Any]]
+    warnings: Mapped[list[Any]]
+    error: Mapped[dict[str, Any] | None]
+    results: Mapped[list[Any]]
+    version: Mapped[int] = mapped_column(BigInteger, default=1)
+    created_at: Mapped[float]
+    updated_at: Mapped[float]
+    finished_at: Mapped[float | None]
+    expires_at: Mapped[float | None]
+    deleted_at: Mapped[float | None]
+    purged_at: Mapped[float | None]
+
+    __table_args__ = (Index("ix_jobs_owner_id", "owner", "id"), Index("ix_jobs_state_id", "state", "id"))
+
+
+class EventRow(Base):
+    """A change of state or of stage, replayed to listeners that come back."""
+
+    __tablename__ = "events"
+
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True)
+    version: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False)
+    data: Mapped[dict[str, Any]]
+
+
+class IdempotencyRow(Base):
+    """A request that is being answered (`job_id` is null until `held_until`) or was answered with a job."""
+
+    __tablename__ = "idempotency"
+
+    owner: Mapped[str] = mapped_column(primary_key=True)
+    token: Mapped[str] = mapped_column(primary_key=True)
+    body_sha256: Mapped[str]
+    holder: Mapped[str]
+    held_until: Mapped[float]
+    job_id: Mapped[str | None] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"))
+    created_at: Mapped[float]

@@ -1,0 +1,346 @@
+"""Job rows, and the one table of legal state transitions.
+
+How a worker carries a job (`store = open_store(settings)`; RQ calls `advtex_worker.tasks.run_job(job_id, attempt)`):
+
+1. `claim = store.records.claim(job_id, attempt, worker)`. `StaleAttempt` here means that somebody else has the job or
+   that it was canceled: return quietly, it is not an error.
+2. `if store.results.adopt(job_id): return`: an earlier attempt had already finished, only its row was not told.
+3. Fetch the scan: `store.blobs.fetch(claim.scan_key, path)`. Resume: every blob below
+   `keys.checkpoints_prefix(job_id)`, attempts in ascending order, laid over one another (`keys.py`).
+4. Every second or two, and from a thread that does not wait for the engine:
+   `lease = store.records.heartbeat(job_id, attempt, progress=…, reached=…)`. `lease.cancel_requested` -> stop the
+   engine with a checkpoint. `StaleAttempt` -> the lease is lost: stop at once, upload nothing more. A heartbeat that
+   fails because the database is away is no loss: try again until `lease_seconds` have passed since the last good one.
+5. New checkpoint files: `store.blobs.upload(path, keys.checkpoint_prefix(job_id, attempt) + name)`.
+6. The end, one of
+   - `store.results.commit(job_id, attempt, {name: path}, warnings)`: uploads the files, writes the manifest once,
+     marks the job `succeeded`;
+   - `records.fail(job_id, attempt, error)`: it would fail again in the same way;
+   - `records.reject(job_id, attempt, error)`: the scan is bad;
+   - `records.canceled(job_id, attempt)`: after the checkpoint of a cancel;
+   - `records.preempt(job_id, attempt)`: SIGTERM: back to the front of the queue, never counted as a failure;
+   - `records.lost(job_id, attempt, log_tail=…)`: the process that ran the engine died. Goes on with the next attempt
+     and gives the job up (`poison`) after three such deaths without progress. A worker that dies as a whole calls
+     nothing: the server's reconciler calls `lost` when the lease has run out.
+
+Every one of these carries the attempt's number; `StaleAttempt` is raised when it is no longer the job's current one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import ColumnElement, and_, select, update
+from sqlalchemy.orm import Session
+
+from advtex_contract.errors import ErrorDetail
+from advtex_contract.jobs import TERMINAL, JobError, JobState, Progress
+from advtex_contract.options import JobOptions
+from advtex_store import keys
+from advtex_store.database import Database
+from advtex_store.errors import IllegalTransition, RecordNotFound, StaleAttempt
+from advtex_store.models import EventRow, JobRow
+
+S = JobState
+TRANSITIONS: Mapping[JobState, frozenset[JobState]] = {
+    S.uploading: frozenset({S.queued, S.rejected, S.canceled}),
+    # A waiting job can succeed: a late attempt's manifest is adopted instead of doing the work again.
+    S.queued: frozenset({S.running, S.succeeded, S.canceled}),
+    S.preempted: frozenset({S.running, S.succeeded, S.canceled}),
+    S.running: frozenset({S.queued, S.preempted, S.succeeded, S.failed, S.canceled, S.rejected}),
+    S.failed: frozenset({S.queued}),
+    S.canceled: frozenset({S.queued}),
+    S.succeeded: frozenset(),
+    S.rejected: frozenset(),
+}
+WAITING = frozenset({S.queued, S.preempted})
+POISON_DEATHS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Lease:
+    """What a heartbeat answers: seconds since 1970 until which the job is held, and whether the user wants it ended."""
+
+    expires_at: float
+    cancel_requested: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """A job that this worker now holds."""
+
+    job_id: str
+    attempt: int
+    owner: str
+    upload_id: str
+    scan_key: str
+    options: JobOptions
+    lease: Lease
+
+
+class Records:
+    """Jobs in the database. Every change of state is one compare-and-set."""
+
+    def __init__(self, database: Database, *, lease_seconds: float = 60.0, retention_seconds: int = 30 * 86400) -> None:
+        self.database = database
+        self.lease_seconds = lease_seconds
+        self.retention_seconds = retention_seconds
+
+    # -- worker ---------------------------------------------------------------------------------------------------
+
+    def claim(self, job_id: str, attempt: int, worker: str, lease_seconds: float | None = None) -> Claim:
+        """Take a waiting job. StaleAttempt: it is not waiting for this attempt (any more)."""
+        with self.database.write() as session:
+            expires_at = self.database.now(session) + (lease_seconds or self.lease_seconds)
+            row = self._move(
+                session,
+                job_id,
+                S.running,
+                fence=attempt,
+                worker=worker[:255],
+                lease_expires_at=expires_at,
+                reached_at_claim=JobRow.reached,
+            )
+            return Claim(
+                job_id=row.id,
+                attempt=row.attempt,
+                owner=row.owner,
+                upload_id=row.upload_id,
+                scan_key=keys.scan_key(row.upload_id),
+                options=JobOptions.model_validate(row.options),
+                lease=Lease(expires_at, row.cancel_requested),
+            )
+
+    def heartbeat(
+        self,
+        job_id: str,
+        attempt: int,
+        progress: Progress | None = None,
+        *,
+        reached: int = 0,
+        lease_seconds: float | None = None,
+        log_tail: str | None = None,
+    ) -> Lease:
+        """Keep the lease and tell how far the attempt is. StaleAttempt: the lease is lost.
+
+        reached: any number that grows with the work and means the same in every attempt (say, stage index times
+        10^7 plus step). Deaths count towards poison only while no attempt gets farther than the ones before.
+        log_tail: the newest lines of the engine's log, shown if the job has to be given up.
+        """
+        with self.database.write() as session:
+            now = self.database.now(session)
+            row = session.scalar(select(JobRow).where(_held(job_id, attempt)).with_for_update())
+            if row is None:
+                raise StaleAttempt(self._why_stale(session, job_id, attempt))
+            row.lease_expires_at = now + (lease_seconds or self.lease_seconds)
+            row.reached = max(row.reached, reached)
+            if log_tail is not None:
+                row.log_tail = log_tail[-8000:]
+            if progress is not None and (data := progress.model_dump(mode="json")) != row.progress:
+                stage_changed = progress.stage != row.progress.get("stage")
+                row.progress, row.updated_at, row.version = data, now, row.version + 1
+                if stage_changed:
+                    _record(session, row, "progress", data)
+            return Lease(row.lease_expires_at, row.cancel_requested)
+
+    def succeed(
+        self,
+        job_id: str,
+        attempt: int | None,
+        results: Sequence[Mapping[str, Any]],
+        warnings: Sequence[ErrorDetail] = (),
+    ) -> None:
+        """The manifest is written (`results.Results` calls this). attempt None: adopt it, whoever holds the job."""
+        with self.database.write() as session:
+            sources = None if attempt is None else frozenset({S.running})
+            data = [dict(result) for result in results]
+            row = self._move(session, job_id, S.succeeded, fence=attempt, sources=sources, results=data)
+            self._finish(session, row, warnings=[*row.warnings, *(w.model_dump(mode="json") for w in warnings)])
+
+    def fail(self, job_id: str, attempt: int, error: JobError) -> None:
+        """The attempt failed for a reason that a new attempt would meet again."""
+        self._end(job_id, attempt, S.failed, error)
+
+    def reject(self, job_id: str, attempt: int, error: JobError) -> None:
+        """The engine found the scan unusable; `error.details` list every problem."""
+        self._end(job_id, attempt, S.rejected, error)
+
+    def canceled(self, job_id: str, attempt: int) -> None:
+        """The worker has stopped, with a checkpoint, because the user asked for it."""
+        self._end(job_id, attempt, S.canceled, None)
+
+    def preempt(self, job_id: str, attempt: int) -> JobState:
+        """The worker must go; the job waits for its next attempt. -> `preempted`, or `canceled` if that was asked."""
+        with self.database.write() as session:
+            row = self._running(session, job_id, attempt)
+            if row.cancel_requested:
+                self._finish(session, self._move(session, job_id, S.canceled, fence=attempt))
+                return S.canceled
+            self._move(session, job_id, S.preempted, fence=attempt, **_released(attempt + 1))
+            return S.preempted
+
+    def lost(self, job_id: str, attempt: int, *, log_tail: str | None = None, expired_only: bool = False) -> JobState:
+        """The attempt died. -> `queued` for the next one, `canceled` if that was asked, or `failed` as poison.
+
+        expired_only: only if the lease has run out (StaleAttempt if not), for callers that did not see it die.
+        """
+        with self.database.write() as session:
+            row = self._running(session, job_id, attempt)
+            if expired_only and (row.lease_expires_at or 0.0) > self.database.now(session):
+                raise StaleAttempt(f"job {job_id}: the lease of attempt {attempt} still holds")
+            if log_tail is not None:
+                row.log_tail = log_tail[-8000:]
+            deaths = 1 if row.reached > row.reached_at_claim else row.deaths + 1
+            if row.cancel_requested:
+                self._finish(session, self._move(session, job_id, S.canceled, fence=attempt))
+                return S.canceled
+            if deaths >= POISON_DEATHS:
+                error = JobError(
+                    code="poison",
+                    message=f"{deaths} attempts in a row died without progress (stage "
+                    f"{row.progress.get('stage') or 'start'}); most often the worker ran out of memory. "
+                    "Try smaller views or a smaller texture, or retry on a larger machine.",
+                    log_tail=row.log_tail,
+                )
+                moved = self._move(session, job_id, S.failed, fence=attempt, deaths=deaths, error=error.model_dump())
+                self._finish(session, moved)
+                return S.failed
+            self._move(session, job_id, S.queued, fence=attempt, deaths=deaths, **_released(attempt + 1))
+            return S.queued
+
+    # -- dispatcher and reconciler --------------------------------------------------------------------------------
+
+    def waiting(self, limit: int) -> list[JobRow]:
+        """Jobs to run next: preempted ones first, then the oldest."""
+        with self.database.read() as session:
+            query = select(JobRow).where(JobRow.state.in_(WAITING), JobRow.deleted_at.is_(None))
+            return list(session.scalars(query.order_by((JobRow.state != S.preempted), JobRow.id).limit(limit)))
+
+    def expired(self, limit: int = 100) -> list[tuple[str, int]]:
+        """(job, attempt) whose lease has run out."""
+        with self.database.read() as session:
+            now = self.database.now(session)
+            query = select(JobRow.id, JobRow.attempt).where(JobRow.state == S.running, JobRow.lease_expires_at < now)
+            return [(job_id, attempt) for job_id, attempt in session.execute(query.limit(limit))]
+
+    # -- user -----------------------------------------------------------------------------------------------------
+
+    def job(self, job_id: str, owner: str | None = None) -> JobRow:
+        """The row; RecordNotFound also when it belongs to another owner or was deleted."""
+        with self.database.read() as session:
+            return self._get(session, job_id, owner)
+
+    def events(self, job_id: str, after_version: int) -> list[EventRow]:
+        """Recorded changes of state and stage, oldest first."""
+        with self.database.read() as session:
+            query = select(EventRow).where(EventRow.job_id == job_id, EventRow.version > after_version)
+            return list(session.scalars(query.order_by(EventRow.version)))
+
+    def cancel(self, job_id: str, owner: str | None = None) -> JobRow:
+        """A waiting job ends at once; a running one is asked to. Canceling a canceled job changes nothing."""
+        with self.database.write() as session:
+            row = self._get(session, job_id, owner, lock=True)
+            if row.state == S.canceled or (row.state == S.running and row.cancel_requested):
+                return row
+            if row.state == S.running:
+                row.cancel_requested = True
+                row.version, row.updated_at = row.version + 1, self.database.now(session)
+                return row
+            return self._finish(session, self._move(session, job_id, S.canceled, attempt=row.attempt - 1))
+
+    def retry(self, job_id: str, owner: str | None = None) -> JobRow:
+        """A failed or canceled job goes on from its checkpoint with a new attempt."""
+        with self.database.write() as session:
+            row = self._get(session, job_id, owner, lock=True)
+            ended = {"cancel_requested": False, "error": None, "finished_at": None, "expires_at": None, "deaths": 0}
+            sources = frozenset({S.failed, S.canceled})
+            return self._move(session, job_id, S.queued, sources=sources, **ended, **_released(row.attempt + 1))
+
+    def delete(self, job_id: str, owner: str | None = None) -> None:
+        """Hide an ended job; its blobs follow (`purged`)."""
+        with self.database.write() as session:
+            row = self._get(session, job_id, owner, lock=True)
+            if JobState(row.state) not in TERMINAL:
+                raise IllegalTransition(f"job {job_id} is {row.state}: cancel it before deleting it")
+            row.deleted_at = self.database.now(session)
+
+    # -- inside ---------------------------------------------------------------------------------------------------
+
+    def _end(self, job_id: str, attempt: int, to: JobState, error: JobError | None) -> None:
+        with self.database.write() as session:
+            data = None if error is None else error.model_dump(mode="json")
+            self._finish(
+                session, self._move(session, job_id, to, sources=frozenset({S.running}), fence=attempt, error=data)
+            )
+
+    def _get(self, session: Session, job_id: str, owner: str | None, *, lock: bool = False) -> JobRow:
+        query = select(JobRow).where(JobRow.id == job_id, JobRow.deleted_at.is_(None))
+        if owner is not None:
+            query = query.where(JobRow.owner == owner)
+        row = session.scalar(query.with_for_update() if lock else query)
+        if row is None:
+            raise RecordNotFound(f"there is no job {job_id}")
+        return row
+
+    def _running(self, session: Session, job_id: str, attempt: int) -> JobRow:
+        row = session.scalar(select(JobRow).where(_held(job_id, attempt)).with_for_update())
+        if row is None:
+            raise StaleAttempt(self._why_stale(session, job_id, attempt))
+        return row
+
+    def _move(
+        self,
+        session: Session,
+        job_id: str,
+        to: JobState,
+        *,
+        fence: int | None = None,
+        sources: frozenset[JobState] | None = None,
+        **values: Any,
+    ) -> JobRow:
+        """Compare-and-set along TRANSITIONS. `fence`: only if this is the job's attempt; `sources`: only from these."""
+        allowed = {state for state, targets in TRANSITIONS.items() if to in targets}
+        where = [JobRow.id == job_id, JobRow.deleted_at.is_(None), JobRow.state.in_(allowed & (sources or allowed))]
+        if fence is not None:
+            where.append(JobRow.attempt == fence)
+        session.flush()
+        now = self.database.now(session)
+        statement = update(JobRow).where(*where).values(state=to, version=JobRow.version + 1, updated_at=now, **values)
+        row: JobRow | None = session.scalar(
+            statement.returning(JobRow), execution_options={"populate_existing": True, "synchronize_session": False}
+        )
+        if row is None and fence is not None:
+            raise StaleAttempt(self._why_stale(session, job_id, fence))
+        if row is None:
+            raise IllegalTransition(f"job {job_id} is {self._get(session, job_id, None).state}, it cannot become {to}")
+        _record(session, row, "state", {"state": to.value, "attempt": row.attempt, "at": now})
+        return row
+
+    def _finish(self, session: Session, row: JobRow, **values: Any) -> JobRow:
+        row.finished_at = self.database.now(session)
+        row.expires_at = row.finished_at + self.retention_seconds
+        row.lease_expires_at = None
+        row.cancel_requested = False
+        for name, value in values.items():
+            setattr(row, name, value)
+        return row
+
+    def _why_stale(self, session: Session, job_id: str, attempt: int) -> str:
+        row = session.get(JobRow, job_id)
+        if row is None:
+            return f"there is no job {job_id}"
+        return f"attempt {attempt} of job {job_id} is stale: the job is {row.state} at attempt {row.attempt}"
+
+
+def _held(job_id: str, attempt: int) -> ColumnElement[bool]:
+    return and_(JobRow.id == job_id, JobRow.state == S.running, JobRow.attempt == attempt, JobRow.deleted_at.is_(None))
+
+
+def _released(next_attempt: int) -> dict[str, Any]:
+    return {"attempt": next_attempt, "worker": None, "lease_expires_at": None}
+
+
+def _record(session: Session, row: JobRow, kind: str, data: Mapping[str, Any]) -> None:
+    session.add(EventRow(job_id=row.id, version=row.version, data={"kind": kind, **data}))

@@ -1,0 +1,54 @@
+"""Everything that server and worker remember, opened in one call."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from advtex_store.accounts import Accounts
+from advtex_store.blobs import Blobs, open_blobs
+from advtex_store.database import Database
+from advtex_store.queue import JobQueue, connect_redis
+from advtex_store.records import Records
+from advtex_store.results import Results
+from advtex_store.settings import StoreSettings
+from advtex_store.submissions import Submissions
+from advtex_store.uploads import Uploads
+
+
+@dataclass(frozen=True, slots=True)
+class Store:
+    """The truth (rows), the bytes (blobs) and the transport (queue)."""
+
+    settings: StoreSettings
+    database: Database
+    records: Records
+    uploads: Uploads
+    submissions: Submissions
+    accounts: Accounts
+    blobs: Blobs
+    results: Results
+    queue: JobQueue
+
+    def close(self) -> None:
+        """Close connections."""
+        self.database.close()
+        self.queue.redis.close()
+
+
+def open_store(settings: StoreSettings) -> Store:
+    """Connect lazily: nothing is contacted before it is used. The schema must be up to date (`upgrade_database`)."""
+    database = Database(settings.database)
+    retention = settings.retention_seconds
+    records = Records(database, lease_seconds=settings.lease_seconds, retention_seconds=retention)
+    blobs = open_blobs(settings.blobs, settings.spool_dir)
+    return Store(
+        settings=settings,
+        database=database,
+        records=records,
+        uploads=Uploads(database, retention_seconds=retention),
+        submissions=Submissions(database, retention_seconds=retention),
+        accounts=Accounts(database),
+        blobs=blobs,
+        results=Results(records, blobs),
+        queue=JobQueue(connect_redis(settings)),
+    )

@@ -1,0 +1,162 @@
+"""New jobs, lists of them, and idempotency keys.
+
+A request with an idempotency key first reserves it, then checks the scan, then creates the job and binds the key to it
+in one transaction. A reservation whose request died is taken over after `HOLD_SECONDS`.
+"""
+
+from __future__ import annotations
+
+import secrets
+from dataclasses import dataclass
+
+from sqlalchemy import delete, select, update
+from sqlalchemy.dialects import postgresql, sqlite
+
+from advtex_contract.errors import ErrorDetail
+from advtex_contract.jobs import JobError, JobSpec, JobState, Progress
+from advtex_store.database import Database
+from advtex_store.errors import IdempotencyInFlight, IdempotencyMismatch, RecordNotFound
+from advtex_store.ids import new_id
+from advtex_store.models import EventRow, IdempotencyRow, JobRow, UploadRow
+
+HOLD_SECONDS = 300.0
+
+
+@dataclass(frozen=True, slots=True)
+class Reservation:
+    """An idempotency key that this request holds."""
+
+    owner: str
+    token: str
+    holder: str
+
+
+class Submissions:
+    """Jobs as users make and list them."""
+
+    def __init__(self, database: Database, *, retention_seconds: int = 30 * 86400) -> None:
+        self.database = database
+        self.retention_seconds = retention_seconds
+
+    def reserve(self, owner: str, token: str, body_sha256: str) -> Reservation | JobRow:
+        """Hold the key, or the job that it made before. IdempotencyMismatch, IdempotencyInFlight."""
+        holder = secrets.token_hex(8)
+        with self.database.write() as session:
+            now = self.database.now(session)
+            insert = sqlite.insert if session.get_bind().dialect.name == "sqlite" else postgresql.insert
+            session.execute(
+                insert(IdempotencyRow)
+                .values(
+                    owner=owner,
+                    token=token,
+                    body_sha256=body_sha256,
+                    holder=holder,
+                    held_until=now + HOLD_SECONDS,
+                    created_at=now,
+                )
+                .on_conflict_do_nothing()
+            )
+            row = session.get_one(IdempotencyRow, (owner, token), with_for_update=True)
+            if row.holder == holder:
+                return Reservation(owner, token, holder)
+            if row.body_sha256 != body_sha256:
+                raise IdempotencyMismatch(f"the idempotency key {token!r} was used before with another body")
+            if row.job_id is not None:
+                return session.get_one(JobRow, row.job_id)
+            if row.held_until > now:
+                raise IdempotencyInFlight(f"a request with the idempotency key {token!r} is still being answered")
+            row.holder, row.held_until = holder, now + HOLD_SECONDS
+            return Reservation(owner, token, holder)
+
+    def release(self, reservation: Reservation) -> None:
+        """The request made no job: the key is free again."""
+        with self.database.write() as session:
+            session.execute(
+                delete(IdempotencyRow).where(
+                    IdempotencyRow.owner == reservation.owner,
+                    IdempotencyRow.token == reservation.token,
+                    IdempotencyRow.holder == reservation.holder,
+                    IdempotencyRow.job_id.is_(None),
+                )
+            )
+
+    def create_job(
+        self,
+        owner: str,
+        spec: JobSpec,
+        *,
+        warnings: list[ErrorDetail] | None = None,
+        rejection: JobError | None = None,
+        reservation: Reservation | None = None,
+    ) -> JobRow:
+        """A job in state `queued`, or `rejected` when there is a rejection. RecordNotFound: no such finished upload."""
+        with self.database.write() as session:
+            upload = session.scalar(
+                select(UploadRow)
+                .where(UploadRow.id == spec.upload_id, UploadRow.owner == owner)
+                .where(UploadRow.deleted_at.is_(None), UploadRow.sha256.is_not(None))
+                .with_for_update()
+            )
+            if upload is None:
+                raise RecordNotFound(f"there is no finished upload {spec.upload_id}")
+            now = self.database.now(session)
+            state = JobState.rejected if rejection else JobState.queued
+            row = JobRow(
+                id=new_id(now),
+                owner=owner,
+                upload_id=spec.upload_id,
+                state=state.value,
+                label=spec.label,
+                options=spec.options.model_dump(mode="json"),
+                attempt=0 if rejection else 1,
+                progress=Progress().model_dump(mode="json"),
+                warnings=[w.model_dump(mode="json") for w in warnings or []],
+                error=rejection.model_dump(mode="json") if rejection else None,
+                results=[],
+                version=1,
+                created_at=now,
+                updated_at=now,
+                finished_at=now if rejection else None,
+                expires_at=now + self.retention_seconds if rejection else None,
+            )
+            session.add(row)
+            session.flush()
+            session.add(
+                EventRow(
+                    job_id=row.id,
+                    version=1,
+                    data={"kind": "state", "state": state.value, "attempt": row.attempt, "at": now},
+                )
+            )
+            if reservation is not None:
+                bound = session.execute(
+                    update(IdempotencyRow)
+                    .where(IdempotencyRow.owner == owner, IdempotencyRow.token == reservation.token)
+                    .where(IdempotencyRow.holder == reservation.holder, IdempotencyRow.job_id.is_(None))
+                    .values(job_id=row.id)
+                    .returning(IdempotencyRow.token)
+                ).first()
+                if bound is None:
+                    raise IdempotencyInFlight(f"another request took over the idempotency key {reservation.token!r}")
+            return row
+
+    def list_jobs(
+        self,
+        owner: str,
+        *,
+        state: JobState | None = None,
+        label: str | None = None,
+        cursor: str | None = None,
+        limit: int = 50,
+    ) -> tuple[list[JobRow], str | None]:
+        """A page of jobs, newest first, and the cursor of the next page."""
+        query = select(JobRow).where(JobRow.owner == owner, JobRow.deleted_at.is_(None))
+        if state is not None:
+            query = query.where(JobRow.state == state)
+        if label is not None:
+            query = query.where(JobRow.label == label)
+        if cursor is not None:
+            query = query.where(JobRow.id < cursor)
+        with self.database.read() as session:
+            rows = list(session.scalars(query.order_by(JobRow.id.desc()).limit(limit + 1)))
+        return rows[:limit], rows[limit - 1].id if len(rows) > limit else None

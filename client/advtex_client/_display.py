@@ -1,0 +1,167 @@
+"""What the command line shows: bars and notes on stderr, data on stdout."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from pydantic import BaseModel
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TaskID, TextColumn, TransferSpeedColumn
+from rich.table import Table
+
+from advtex_client.errors import ClientError
+from advtex_contract.errors import ErrorDetail
+from advtex_contract.jobs import JobState, JobView, ResultFile
+
+
+class Display:
+    """One command's output; with `as_json`, everything on stdout is JSON."""
+
+    def __init__(self, as_json: bool) -> None:
+        self.as_json = as_json
+        self.notes = Console(stderr=True, highlight=False, soft_wrap=True)
+
+    def note(self, text: str) -> None:
+        """A line for people, on stderr."""
+        self.notes.print(text, markup=False)
+
+    def data(self, value: BaseModel | Sequence[BaseModel] | dict[str, Any] | list[Any], text: str) -> None:
+        """The command's result, on stdout: `value` as one line of JSON, or `text`."""
+        print(json.dumps(_plain(value)) if self.as_json else text, flush=True)
+
+    def failure(self, error: ClientError, exit_code: int) -> None:
+        """An error, on stderr."""
+        if self.as_json:
+            body = {"code": error.code, "message": str(error), "exit_code": exit_code, "details": _plain(error.details)}
+            print(json.dumps({"error": body}), file=sys.stderr, flush=True)
+            return
+        self.note(f"error: {error}")
+        for line in finding_lines(error.details):
+            self.note(f"  {line}")
+
+    @contextmanager
+    def bytes_bar(self, title: str) -> Iterator[BytesBar]:
+        """A bar for an upload or a download."""
+        columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
+        with Progress(*columns, console=self.notes, transient=True, disable=not self._bars) as bars:
+            yield BytesBar(bars, title)
+
+    @contextmanager
+    def job_bar(self) -> Iterator[JobBar]:
+        """A bar for a job's stages and steps; a line per stage where stderr is no terminal."""
+        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[detail]}"))
+        with Progress(*columns, console=self.notes, transient=True, disable=not self._bars) as bars:
+            yield JobBar(bars, self)
+
+    @property
+    def _bars(self) -> bool:
+        return self.notes.is_terminal
+
+
+class BytesBar:
+    """Shows bytes of one or several files."""
+
+    def __init__(self, bars: Progress, title: str) -> None:
+        self._bars = bars
+        self._title = title
+        self._tasks: dict[str, TaskID] = {}
+
+    def upload(self, done: int, total: int) -> None:
+        self._show(self._title, done, total)
+
+    def download(self, file: ResultFile, done: int) -> None:
+        self._show(file.name, done, file.size)
+
+    def _show(self, name: str, done: int, total: int) -> None:
+        if name not in self._tasks:
+            self._tasks[name] = self._bars.add_task(name, total=total)
+        self._bars.update(self._tasks[name], completed=done)
+
+
+class JobBar:
+    """Shows where a job stands."""
+
+    def __init__(self, bars: Progress, display: Display) -> None:
+        self._bars = bars
+        self._display = display
+        self._task = bars.add_task("", total=None, detail="")
+        self._said = ""
+
+    def show(self, job: JobView) -> None:
+        progress = job.progress
+        where = progress.stage if job.state is JobState.running and progress.stage else job.state.value
+        if self._bars.disable and where != self._said:
+            self._display.note(f"job {job.id}: {where}")
+        self._said = where
+        detail = f"{progress.step}/{progress.steps}" if progress.steps else ""
+        if progress.eta_seconds is not None:
+            detail += f"  about {duration(progress.eta_seconds)} left"
+        total = progress.steps or None
+        self._bars.update(self._task, description=where, total=total, completed=progress.step, detail=detail)
+
+    def trouble(self, error: ClientError) -> None:
+        self._display.note(f"{error}; the job is not affected, trying again")
+
+
+def duration(seconds: float) -> str:
+    """`42 s`, `3 min 20 s`, `2 h 5 min`."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    return f"{whole // 3600} h {whole % 3600 // 60} min"
+
+
+def finding_lines(details: Iterable[ErrorDetail]) -> list[str]:
+    """One line per finding: severity, place, what is wrong, what helps."""
+    return [
+        f"{d.severity}: {d.where + ': ' if d.where else ''}{d.message}{f' -> {d.remedy}' if d.remedy else ''}"
+        for d in details
+    ]
+
+
+def job_lines(job: JobView) -> str:
+    """A job for people."""
+    progress = job.progress
+    lines = [f"job      {job.id}", f"state    {job.state}" + (f" (attempt {job.attempt})" if job.attempt > 1 else "")]
+    if job.label:
+        lines.append(f"label    {job.label}")
+    if progress.stage:
+        steps = f", step {progress.step} of {progress.steps}" if progress.steps else ""
+        eta = f", about {duration(progress.eta_seconds)} left" if progress.eta_seconds is not None else ""
+        lines.append(f"stage    {progress.stage}{steps}{eta}")
+    if progress.losses:
+        lines.append("losses   " + ", ".join(f"{name} {value:.4g}" for name, value in progress.losses.items()))
+    lines += [f"warning  {line}" for line in finding_lines(job.warnings)]
+    if job.error:
+        lines += [f"error    {job.error.message}", *(f"         {line}" for line in finding_lines(job.error.details))]
+    lines += [f"result   {file.name} ({file.size} bytes)" for file in job.results]
+    if job.expires_at:
+        lines.append(f"kept until {job.expires_at:%Y-%m-%d %H:%M} UTC")
+    return "\n".join(lines)
+
+
+def job_table(jobs: Sequence[JobView]) -> str:
+    """Jobs as a table for people, newest first."""
+    table = Table(box=None, pad_edge=False)
+    for title in ("job", "state", "stage", "created", "label"):
+        table.add_column(title, overflow="fold")
+    for job in jobs:
+        progress = job.progress
+        stage = f"{progress.stage} {progress.step}/{progress.steps}" if progress.steps else progress.stage
+        table.add_row(job.id, job.state, stage, f"{job.created_at:%Y-%m-%d %H:%M}", job.label)
+    console = Console(width=160, highlight=False, markup=False, emoji=False)
+    with console.capture() as captured:
+        console.print(table)
+    return "\n".join(line.rstrip() for line in captured.get().splitlines())
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value

@@ -1,0 +1,45 @@
+"""What both clients do to a request before it is sent."""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import httpx
+
+from advtex_client._calls import Call
+from advtex_client.config import ClientConfig
+from advtex_client.errors import IntegrityError
+from advtex_contract.jobs import ResultFile
+
+LIMITS = httpx.Limits(max_connections=10)
+TIMEOUT = httpx.Timeout(60.0, connect=10.0)
+UPLOAD_TIMEOUT = httpx.Timeout(60.0, connect=10.0, read=600.0)  # the answer comes after the bytes are hashed and synced
+
+
+def base_headers(config: ClientConfig) -> dict[str, str]:
+    try:
+        release = version("advtex")
+    except PackageNotFoundError:  # run from a source tree
+        release = "0"
+    headers = {"User-Agent": f"advtex-client/{release}"}
+    return headers | {"Authorization": f"Bearer {config.api_key}"} if config.api_key else headers
+
+
+def build(http: httpx.Client | httpx.AsyncClient, call: Call[Any]) -> httpx.Request:
+    if call.body is None:
+        return http.build_request(call.method, call.path, json=call.json, params=call.params, headers=call.headers)
+    request = http.build_request(call.method, call.path, headers=call.headers, timeout=UPLOAD_TIMEOUT)
+    request.stream = call.body
+    return request
+
+
+def result_url(base: str, file: ResultFile) -> str:
+    """The address of a result: always on the same server, whatever the answer says, so the key goes nowhere else."""
+    url = httpx.URL(base + "/").join(file.url)
+    home = httpx.URL(base)
+    if (url.scheme, url.host, url.port) != (home.scheme, home.host, home.port):
+        raise IntegrityError(
+            f"{file.name} is said to lie at {url}, which is not the server {base}; nothing was fetched"
+        )
+    return str(url)

@@ -1,0 +1,100 @@
+"""Submitting a scan, step by step, without sending anything itself.
+
+`submission` is a generator: it yields each Call to be made, receives its answer (or the ApiError that it ended in),
+and returns the job. Both clients drive it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any
+
+from advtex_client import _calls as calls
+from advtex_client.errors import ClientError, ConflictError, NotFoundError, ScanRejectedError
+from advtex_client.memory import Submission, SubmissionMemory
+from advtex_client.uploads import OnBytes, PackedScan
+from advtex_contract.errors import ErrorCode, ErrorDetail
+from advtex_contract.jobs import JobSpec, JobView
+from advtex_contract.options import JobOptions
+from advtex_scan.check import check_scan
+
+Steps = Generator[calls.Call[Any], Any, JobView]
+
+
+def ensure_scan(scan: Path) -> None:
+    """The check that the server makes too, before anything is sent. Raises ScanRejectedError with every finding."""
+    report = check_scan(scan)
+    if report.ok:
+        return
+    details = [
+        ErrorDetail(severity=f.severity, code=f.code, where=f.where, message=f.message, remedy=f.remedy)
+        for f in report.findings
+    ]
+    errors = sum(detail.severity == "error" for detail in details)
+    raise ScanRejectedError(f"{scan} cannot be textured: {errors} problem(s) found, nothing was sent", details)
+
+
+def submission(
+    memory: SubmissionMemory,
+    scan: PackedScan,
+    options: JobOptions,
+    label: str,
+    *,
+    new: bool = False,
+    on_bytes: OnBytes | None = None,
+) -> Steps:
+    """Go on with a remembered submission, or begin one. With `new`, a job of its own is made in any case."""
+    known = memory.load()
+    if new and known.job_id is not None:
+        known = Submission(generation=known.generation + 1, upload_id=known.upload_id)
+    if known.job_id is not None:
+        try:
+            job: JobView = yield calls.get_job(known.job_id)
+            return job
+        except NotFoundError:  # deleted or expired: a new one is wanted
+            known = Submission(generation=known.generation + 1, upload_id=known.upload_id)
+    known = yield from _uploaded(memory, known, scan, on_bytes)
+    assert known.upload_id is not None
+    spec = JobSpec(upload_id=known.upload_id, options=options, label=label)
+    try:
+        job = yield calls.create_job(spec, memory.idempotency_key(known))
+    except ConflictError as error:
+        job = yield from _made_elsewhere(memory, error)
+    memory.save(known.model_copy(update={"job_id": job.id}))
+    return job
+
+
+def _uploaded(
+    memory: SubmissionMemory, known: Submission, scan: PackedScan, on_bytes: OnBytes | None
+) -> Generator[calls.Call[Any], Any, Submission]:
+    """The submission with an upload that the server holds whole; sent only if it does not hold it already."""
+    if known.upload_id is not None:
+        try:
+            upload = yield calls.get_upload(known.upload_id)
+            if upload.complete and upload.sha256 == scan.sha256:
+                return known
+        except NotFoundError:
+            pass
+    upload = yield calls.upload(scan, on_bytes)
+    if upload.sha256 != scan.sha256:
+        raise ClientError(
+            f"{scan.filename} arrived damaged (sha256 {upload.sha256}, sent {scan.sha256}); submit it again"
+        )
+    known = known.model_copy(update={"upload_id": upload.id})
+    memory.save(known)
+    return known
+
+
+def _made_elsewhere(memory: SubmissionMemory, error: ConflictError) -> Steps:
+    """Another run of the same submission was faster: its job is ours."""
+    if error.error.code in (ErrorCode.idempotency_mismatch, ErrorCode.idempotency_in_flight):
+        other = memory.load()
+        if other.job_id is not None:
+            job: JobView = yield calls.get_job(other.job_id)
+            return job
+        raise ClientError(
+            "this scan was submitted before with the same options and label, but not by this computer or not as "
+            "remembered here; `advtex-client list` shows that job, and --new makes another one"
+        ) from error
+    raise error

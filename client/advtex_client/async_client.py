@@ -1,0 +1,238 @@
+"""The client for asyncio programs: `AsyncClient`, method for method the same as `Client`."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Self, TypeVar
+
+import anyio
+import httpx
+from anyio.to_thread import run_sync
+
+from advtex_client import _calls as calls
+from advtex_client._events import OnTrouble, Watch, is_event_stream
+from advtex_client._http import LIMITS, TIMEOUT, base_headers, build, result_url
+from advtex_client._submission import ensure_scan, submission
+from advtex_client.config import load_config
+from advtex_client.downloads import Download, OnFileBytes, is_there, target_path
+from advtex_client.errors import ApiError, ClientError
+from advtex_client.memory import SubmissionMemory
+from advtex_client.uploads import OnBytes, packed
+from advtex_contract.jobs import JobSpec, JobState, JobView, ResultFile, UploadView
+from advtex_contract.options import JobOptions
+
+T = TypeVar("T")
+
+
+class AsyncClient:
+    """Talks to one advtex server. A context manager; every error is a `ClientError`.
+
+    url, api_key    as in `load_config` when absent
+    retries         how often a request is sent again after passing trouble; only idempotent ones are
+    transport       an httpx transport, for tests
+    """
+
+    def __init__(
+        self,
+        url: str | None = None,
+        api_key: str | None = None,
+        *,
+        retries: int = 4,
+        transport: httpx.AsyncBaseTransport | None = None,
+    ) -> None:
+        self.config = load_config(url, api_key)
+        self._retries = retries
+        self._http = httpx.AsyncClient(
+            base_url=self.config.url,
+            headers=base_headers(self.config),
+            timeout=TIMEOUT,
+            limits=LIMITS,
+            transport=transport,
+        )
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        await self._http.aclose()
+
+    async def upload(self, scan: Path, *, on_bytes: OnBytes | None = None) -> UploadView:
+        """Send a scan, zip or folder."""
+        with ExitStack() as stack:
+            archive = await run_sync(stack.enter_context, packed(scan))
+            return await self._run(calls.upload(archive, on_bytes))
+
+    async def get_upload(self, upload_id: str) -> UploadView:
+        return await self._run(calls.get_upload(upload_id))
+
+    async def create_job(self, spec: JobSpec, *, idempotency_key: str) -> JobView:
+        """Make a job from a finished upload. The same key with the same body gives the same job."""
+        return await self._run(calls.create_job(spec, idempotency_key))
+
+    async def submit(
+        self,
+        scan: Path,
+        options: JobOptions | None = None,
+        *,
+        label: str = "",
+        new: bool = False,
+        on_bytes: OnBytes | None = None,
+    ) -> JobView:
+        """Check, pack, send and queue a scan; the same scan with the same options and label gives the same job again.
+
+        Raises ScanRejectedError, with every problem found, before anything is sent. `new` makes another job.
+        """
+        await run_sync(ensure_scan, scan)
+        options = options or JobOptions()
+        with ExitStack() as stack:
+            archive = await run_sync(stack.enter_context, packed(scan))
+            memory = SubmissionMemory(self.config.url, archive.sha256, options, label)
+            steps = submission(memory, archive, options, label, new=new, on_bytes=on_bytes)
+            try:
+                call = next(steps)
+                while True:
+                    try:
+                        answer = await self._run(call)
+                    except ApiError as error:
+                        call = steps.throw(error)
+                    else:
+                        call = steps.send(answer)
+            except StopIteration as end:
+                job: JobView = end.value
+                return job
+
+    async def get_job(self, job_id: str) -> JobView:
+        return await self._run(calls.get_job(job_id))
+
+    async def list_jobs(
+        self, *, state: JobState | None = None, label: str | None = None, page: int = 100
+    ) -> AsyncIterator[JobView]:
+        """All jobs, newest first, fetched page by page."""
+        cursor = None
+        while True:
+            answer = await self._run(calls.list_jobs(state, label, page, cursor))
+            for job in answer.jobs:
+                yield job
+            if (cursor := answer.next_cursor) is None:
+                return
+
+    async def cancel_job(self, job_id: str) -> JobView:
+        """Stop a job; a running one writes a checkpoint first."""
+        return await self._run(calls.cancel_job(job_id))
+
+    async def retry_job(self, job_id: str) -> JobView:
+        """Queue a failed or canceled job again; it goes on from its newest checkpoint."""
+        return await self._run(calls.retry_job(job_id))
+
+    async def delete_job(self, job_id: str) -> None:
+        await self._run(calls.delete_job(job_id))
+
+    async def watch_job(
+        self, job_id: str, *, timeout: float | None = None, on_trouble: OnTrouble | None = None
+    ) -> AsyncIterator[JobView]:
+        """Every change of a job until it ends, the last one included. Events where the server sends them, else polls.
+
+        Trouble on the line is reported to `on_trouble` and outlived. Raises WaitTimeoutError after `timeout` seconds.
+        """
+        watch = Watch(job_id, timeout, on_trouble)
+        while True:
+            try:
+                job = await self._run(calls.get_job(job_id), retries=0)
+                if watch.is_news(job):
+                    yield job
+                if watch.done:
+                    return
+                async for job in self._events(watch):
+                    yield job
+            except ClientError as error:
+                watch.trouble(error)
+            if watch.done:
+                return
+            await anyio.sleep(watch.pause())
+
+    async def wait_for_job(self, job_id: str, *, timeout: float | None = None) -> JobView:
+        """The finished job. Raises JobFailedError or ScanRejectedError when it did not succeed."""
+        last = None
+        async for job in self.watch_job(job_id, timeout=timeout):
+            last = job
+        assert last is not None
+        return calls.ensure_succeeded(last)
+
+    async def download_results(
+        self,
+        job: JobView,
+        folder: Path,
+        *,
+        names: Sequence[str] | None = None,
+        on_bytes: OnFileBytes | None = None,
+    ) -> list[Path]:
+        """Fetch a job's results below `folder`; what is there already and whole is kept, parts are continued."""
+        files = calls.chosen_results(job, names)
+        targets = [target_path(folder, file.name) for file in files]  # a bad name stops it before the first byte
+        return [await self._download(file, target, on_bytes) for file, target in zip(files, targets, strict=True)]
+
+    async def _download(self, file: ResultFile, target: Path, on_bytes: OnFileBytes | None) -> Path:
+        if await run_sync(is_there, target, file):
+            return target
+        attempts = calls.Attempts(True, self._retries)
+        while True:
+            with Download(target, file) as download:
+                try:
+                    await run_sync(download.load)
+                    if not download.complete:
+                        await self._fetch(file, download, on_bytes)
+                    return await run_sync(download.finish)
+                except (httpx.TransportError, ClientError) as error:
+                    delay = attempts.after_error(error)
+            await anyio.sleep(delay)
+
+    async def _fetch(self, file: ResultFile, download: Download, on_bytes: OnFileBytes | None) -> None:
+        url = result_url(self.config.url, file)
+        async with self._http.stream("GET", url, headers=download.headers()) as response:
+            if not response.is_success:
+                await response.aread()
+            download.begin(response)
+            async for chunk in response.aiter_raw(1 << 18):
+                download.write(chunk)
+                if on_bytes:
+                    on_bytes(file, download.done)
+
+    async def _events(self, watch: Watch) -> AsyncIterator[JobView]:
+        """News from the event stream, until it ends in whatever way."""
+        path = calls.events_path(watch.job_id)
+        try:
+            async with self._http.stream(
+                "GET", path, headers=watch.stream_headers(), timeout=watch.stream_timeout()
+            ) as answer:
+                if not is_event_stream(answer):
+                    return
+                async for line in answer.aiter_lines():
+                    job = watch.view_from_line(line)
+                    if job is not None:
+                        yield job
+                    if watch.done or watch.expired:
+                        return
+        except httpx.TransportError:
+            return  # the next poll tells whether the server is there
+
+    async def _run(self, call: calls.Call[T], retries: int | None = None) -> T:
+        attempts = calls.Attempts(call.idempotent, self._retries if retries is None else retries)
+        while True:
+            delay: float | None
+            try:
+                response = await self._http.send(build(self._http, call))
+            except httpx.TransportError as error:
+                delay = attempts.after_error(error)
+            else:
+                delay = attempts.after_response(response)
+                if delay is None:
+                    return call.parse(response)
+            await anyio.sleep(delay)

@@ -1,0 +1,57 @@
+"""What this computer remembers of its submissions, so that running `submit` again goes on instead of starting over.
+
+One small file per submission, written whole and renamed: a crash leaves the old one or the new one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+
+import platformdirs
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from advtex_contract.options import JobOptions
+
+
+class Submission(BaseModel):
+    """How far a submission came. `generation` counts the jobs made on purpose from the same scan and options."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    generation: int = 0
+    upload_id: str | None = None
+    job_id: str | None = None
+
+
+class SubmissionMemory:
+    """The record of one submission: this scan with these options and this label on this server."""
+
+    def __init__(self, server: str, sha256: str, options: JobOptions, label: str, folder: Path | None = None) -> None:
+        self._identity = hashlib.sha256(
+            "\n".join((sha256, options.model_dump_json(), label)).encode()  # a label holds no line break
+        ).hexdigest()
+        place = hashlib.sha256(f"{server}\n{self._identity}".encode()).hexdigest()[:32]
+        self.path = (folder or platformdirs.user_state_path("advtex")) / "submissions" / f"{place}.json"
+
+    def load(self) -> Submission:
+        """What is remembered; a fresh record when there is nothing, or nothing that can be read."""
+        try:
+            return Submission.model_validate_json(self.path.read_bytes())
+        except (FileNotFoundError, ValidationError):
+            return Submission()
+
+    def save(self, submission: Submission) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=self.path.parent, suffix=".tmp")
+        with os.fdopen(handle, "wb") as file:
+            file.write(submission.model_dump_json().encode())
+            file.flush()
+            os.fsync(file.fileno())
+        Path(name).replace(self.path)
+
+    def idempotency_key(self, submission: Submission) -> str:
+        """The same for every try of the same submission."""
+        return f"{self._identity[:48]}-{submission.generation}"

@@ -1,0 +1,150 @@
+"""Device depth: stored values -> metres -> the color camera's image; and which encoding the values really have."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from advtex_engine.cameras import scaled_camera
+from advtex_engine.errors import Problem
+from advtex_engine.monitor import Monitor
+from advtex_engine.rasterize import rasterize
+from advtex_engine.scene import Camera, Mesh
+
+Raw = npt.NDArray[np.uint16]
+
+NO_READING = (0, 65535)
+# Encodings are judged on images of at most this width, by readings within AGREEMENT of the mesh's depth; an encoding
+# fits if FITTING_SHARE of the readings agree, and nothing is judged on fewer than MIN_READINGS.
+JUDGED_WIDTH = 160
+AGREEMENT = 0.05
+FITTING_SHARE = 0.5
+MIN_READINGS = 500
+
+
+@dataclass(frozen=True)
+class DepthEncoding:
+    """How metres are stored in 16 bits: units per metre, after rotating the bits left by 3 places if `rotated`.
+
+    SUN3D and its kin store d as (d << 3) | (d >> 13), so that viewers show something: d = (v >> 3) | (v << 13).
+    """
+
+    name: str
+    units_per_metre: float
+    rotated: bool = False
+
+    def metres(self, raw: Raw) -> npt.NDArray[np.float32]:
+        """[H,W] uint16 -> [H,W] float32 metres, 0 = no reading."""
+        units = (raw >> 3) | (raw << 13) if self.rotated else raw
+        empty = np.isin(raw, NO_READING) | np.isin(units, NO_READING)
+        return np.where(empty, np.float32(0), units.astype(np.float32) / np.float32(self.units_per_metre))
+
+
+ROTATED = (
+    DepthEncoding("bit-rotated millimetres", 1_000.0, rotated=True),
+    DepthEncoding("bit-rotated tenths of a millimetre", 10_000.0, rotated=True),
+)
+
+
+def inflate(data: bytes, width: int, height: int) -> Raw:
+    """zlib-compressed little-endian uint16 [height,width]; ValueError if it is anything else."""
+    size = 2 * width * height
+    stream = zlib.decompressobj()
+    try:
+        values = stream.decompress(data, size + 1)
+    except zlib.error as error:
+        raise ValueError(f"is no zlib stream ({error})") from error
+    if len(values) != size:
+        raise ValueError(f"does not hold {width}x{height} readings")
+    return np.frombuffer(values, "<u2").reshape(height, width)
+
+
+def measure_depth(
+    mesh: Mesh, samples: Sequence[tuple[Camera, Raw]], declared: DepthEncoding, monitor: Monitor
+) -> DepthEncoding | None:
+    """The encoding whose depth agrees with the mesh; None, with a warning, if none does.
+
+    samples: depth cameras at the stored images' size, and those images. The declared encoding is taken if it fits or
+    if too few readings meet the mesh to judge; another one brings a warning.
+    """
+    pairs = [_readings(mesh, camera, raw) for camera, raw in samples]
+    stored = np.concatenate([raw for raw, _ in pairs]) if pairs else np.zeros(0, np.uint16)
+    rendered = np.concatenate([depth for _, depth in pairs]) if pairs else np.zeros(0, np.float32)
+    if len(stored) < MIN_READINGS:
+        return declared
+    shares = {encoding: agreement(encoding, stored, rendered) for encoding in (declared, *ROTATED)}
+    best = max(shares, key=lambda encoding: shares[encoding])
+    if shares[declared] >= FITTING_SHARE:
+        return declared
+    if shares[best] >= FITTING_SHARE:
+        monitor.warning(
+            Problem(
+                "depth_encoding",
+                "depth",
+                f"the depth images hold {best.name}, not {declared.name}: so read, {shares[best]:.0%} of the readings "
+                f"agree with the mesh, otherwise {shares[declared]:.0%}",
+                "none needed; the depth is read that way",
+            )
+        )
+        return best
+    monitor.warning(
+        Problem(
+            "depth_ignored",
+            "depth",
+            f"the depth images disagree with the mesh however they are read (at best {shares[best]:.0%} of the "
+            f"readings are within {AGREEMENT:.0%}); they are ignored",
+            "check the depth scale, the depth camera's intrinsics and the depth-to-color transform",
+        )
+    )
+    return None
+
+
+def agreement(encoding: DepthEncoding, raw: Raw, rendered: npt.NDArray[np.float32]) -> float:
+    """Share of the readings [N] within AGREEMENT of the mesh's depth [N] (metres, > 0)."""
+    metres = encoding.metres(raw)
+    return float((np.abs(metres - rendered) < AGREEMENT * rendered).mean())
+
+
+def _readings(mesh: Mesh, camera: Camera, raw: Raw) -> tuple[Raw, npt.NDArray[np.float32]]:
+    """Stored values [N] and the mesh's depth [N] where both exist, on a grid of at most JUDGED_WIDTH columns."""
+    width = min(JUDGED_WIDTH, camera.width)
+    height = max(1, round(camera.height * width / camera.width))
+    rendered = rasterize(mesh, scaled_camera(camera, width, height)).depth.numpy()
+    rows = ((np.arange(height) + 0.5) * raw.shape[0] / height).astype(np.int64)
+    columns = ((np.arange(width) + 0.5) * raw.shape[1] / width).astype(np.int64)
+    stored = raw[rows[:, None], columns]
+    both = (rendered > 0) & ~np.isin(stored, NO_READING)
+    return stored[both], rendered[both]
+
+
+def depth_in_color_image(depth: Tensor, depth_camera: Camera, color_camera: Camera) -> Tensor:
+    """Depth [h,w] (metres, 0 = none) of one camera as [H,W] seen by another.
+
+    Every reading is projected into the pixel it falls in; the nearest one wins. Where the color image is the finer
+    one, readings are repeated so that they leave no gaps. Not differentiable.
+    """
+    assert depth.shape == (depth_camera.height, depth_camera.width)
+    finer = float((color_camera.K[0, 0] / depth_camera.K[0, 0]).max())
+    repeat = max(1, round(finer + 0.25))
+    if repeat > 1:
+        depth = depth.repeat_interleave(repeat, 0).repeat_interleave(repeat, 1)
+        depth_camera = scaled_camera(depth_camera, depth_camera.width * repeat, depth_camera.height * repeat)
+    row, column = torch.nonzero(depth > 0, as_tuple=True)
+    z = depth[row, column].double()
+    pixel = torch.stack([column + 0.5, row + 0.5, torch.ones_like(z)], dim=1)
+    to_color = color_camera.world_to_camera @ torch.linalg.inv(depth_camera.world_to_camera)
+    ray = torch.linalg.inv(depth_camera.K).T
+    seen = (pixel @ ray * z[:, None]) @ to_color[:3, :3].T + to_color[:3, 3]
+    x, y = ((seen @ color_camera.K.T)[:, :2] / seen[:, 2:]).unbind(1)
+    inside = (seen[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < color_camera.width) & (y < color_camera.height)
+    index = y[inside].long() * color_camera.width + x[inside].long()
+    nearest = torch.full((color_camera.height * color_camera.width,), torch.inf, dtype=torch.float64)
+    nearest.scatter_reduce_(0, index, seen[inside, 2], "amin")
+    nearest[nearest.isinf()] = 0
+    return nearest.float().view(color_camera.height, color_camera.width)

@@ -1,1 +1,66 @@
-"""What a scan is: manifest, archive access, layouts and the structural check. Standard library only."""
+"""What a scan is: manifest, archive access, layouts and the structural check. Standard library only.
+
+with open_scan("scan.zip") as archive:
+    reading = read_scan(archive)
+    if reading.report.ok:
+        jpeg = archive.read(reading.manifest.frames[0].color)
+
+print(check_scan("scan.zip").format_text())
+"""
+
+from advtex_scan._zip_directory import ArchiveLimits
+from advtex_scan.archive import ScanArchive, open_scan
+from advtex_scan.check import CheckReport, ScanReading, check_scan, read_scan
+from advtex_scan.errors import (
+    ArchiveError,
+    Finding,
+    ImageError,
+    LimitError,
+    MeshError,
+    ScanFormatError,
+    UnsafeArchiveError,
+)
+from advtex_scan.images import ImageHeader, read_image_header
+from advtex_scan.manifest import (
+    IDENTITY,
+    ByteRange,
+    FileRef,
+    FrameEntry,
+    Intrinsics,
+    Matrix4,
+    MeshEntry,
+    ScanKind,
+    ScanManifest,
+    UpAxis,
+)
+from advtex_scan.mesh import MeshFacts
+
+__all__ = [
+    "IDENTITY",
+    "ArchiveError",
+    "ArchiveLimits",
+    "ByteRange",
+    "CheckReport",
+    "FileRef",
+    "Finding",
+    "FrameEntry",
+    "ImageError",
+    "ImageHeader",
+    "Intrinsics",
+    "LimitError",
+    "Matrix4",
+    "MeshEntry",
+    "MeshError",
+    "MeshFacts",
+    "ScanArchive",
+    "ScanFormatError",
+    "ScanKind",
+    "ScanManifest",
+    "ScanReading",
+    "UnsafeArchiveError",
+    "UpAxis",
+    "check_scan",
+    "open_scan",
+    "read_image_header",
+    "read_scan",
+]

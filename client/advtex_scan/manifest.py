@@ -1,6 +1,7 @@
 """What a scan is, whatever layout it came in.
 
-Frames: a camera pose is `camera_to_world`, 4x4, row-major nested tuples, OpenCV axes (x right, y down, z forward), metres.
+Frames: a camera pose is `camera_to_world`, 4x4, row-major nested tuples, OpenCV axes (x right, y down, z
+forward), metres.
 Pixels: the centre of the first pixel is (0.5, 0.5), the image corner (0, 0); layouts whose files count the first
 pixel's centre as (0, 0) add 0.5 to the principal point when they read it.
 Both cameras are modelled: `FrameEntry.camera_to_world` is the color camera's, and the depth camera's is

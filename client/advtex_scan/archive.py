@@ -1,0 +1,228 @@
+"""A scan's files, from a folder or a zip, read as streams; nothing is ever unpacked to disk.
+
+    with open_scan("scan.zip") as archive:
+        archive.names()                       # "color/0.jpg", ...: sorted, relative to the one top folder if there is one
+        archive.read("color/0.jpg", 1 << 20)  # bytes, at most so many
+        archive.read_range("scan.sens", 4096, 100)
+
+Reading is safe from several threads at once: each read uses its own position. Open streams belong to one thread each.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import stat
+from abc import ABC, abstractmethod
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO, Self, cast
+
+from advtex_scan._inflate import Extent, MemberStream, RangeReader
+from advtex_scan._names import common_folder, is_junk, is_nested_archive, unsafe_reason
+from advtex_scan._zip_directory import ArchiveLimits, raise_errors, read_directory, too_many_entries
+from advtex_scan.errors import ArchiveError, Finding, Findings, LimitError
+from advtex_scan.manifest import ByteRange, FileRef
+
+READ_LIMIT = 256 << 20  # bytes that `read` returns at most unless told otherwise
+
+
+class ScanArchive(ABC):
+    """Access to the files of one scan. A context manager; see the module for its use.
+
+    All methods raise ArchiveError (or LimitError) when a file is missing, damaged or larger than asked for.
+    """
+
+    def __init__(self, path: Path, sizes: dict[str, int]) -> None:
+        self.path = path
+        self._prefix = common_folder(list(sizes))
+        self._sizes = {name.removeprefix(self._prefix): sizes[name] for name in sorted(sizes)}
+
+    def names(self) -> tuple[str, ...]:
+        """Relative paths of all files, sorted, with `/` as separator."""
+        return tuple(self._sizes)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._sizes
+
+    def size(self, name: str) -> int:
+        """Size of a file in bytes."""
+        if name not in self._sizes:
+            message = "is not in the scan" if name else "a file name is empty"
+            raise ArchiveError(Finding("error", "missing_file", name, message, "add the file or correct the name"))
+        return self._sizes[name]
+
+    def open(self, name: str) -> BinaryIO:
+        """A buffered stream over a file from its first byte; the caller closes it."""
+        self.size(name)
+        return cast(BinaryIO, io.BufferedReader(self._stream(self._prefix + name), 1 << 16))
+
+    def read(self, ref: FileRef, limit: int = READ_LIMIT) -> bytes:
+        """A whole file or byte range; LimitError if it is longer than `limit` bytes."""
+        length = ref.length if isinstance(ref, ByteRange) else self.size(ref)
+        name = ref.path if isinstance(ref, ByteRange) else ref
+        if length > limit:
+            message = f"is {length} bytes long; at most {limit} are accepted for a file of this kind"
+            raise LimitError(Finding("error", "file_too_large", name, message, "make the file smaller"))
+        if isinstance(ref, ByteRange):
+            return self.read_range(name, ref.offset, length)
+        with self.open(name) as stream:
+            return stream.read()
+
+    def head(self, ref: FileRef, length: int) -> bytes:
+        """The first `length` bytes of a file or byte range, fewer if it is shorter."""
+        if isinstance(ref, ByteRange):
+            return self.read_range(ref.path, ref.offset, min(length, ref.length))
+        return self.read_range(ref, 0, min(length, self.size(ref)))
+
+    def read_range(self, name: str, offset: int, length: int) -> bytes:
+        """`length` bytes from `offset` of a file; reading ranges in rising order passes over the file once."""
+        size = self.size(name)
+        if offset < 0 or length < 0 or offset + length > size:
+            message = f"is {size} bytes long, but bytes {offset} to {offset + length} are needed"
+            raise ArchiveError(Finding("error", "truncated_file", name, message, "copy the file again in full"))
+        return self._range(self._prefix + name, offset, length)
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release the files; nothing can be read from a zip afterwards."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @abstractmethod
+    def _stream(self, name: str) -> io.RawIOBase: ...
+
+    @abstractmethod
+    def _range(self, name: str, offset: int, length: int) -> bytes: ...
+
+
+def open_scan(path: str | os.PathLike[str], limits: ArchiveLimits | None = None) -> ScanArchive:
+    """Open a folder or a zip. Raises ArchiveError with every reason why it is refused."""
+    location = Path(path)
+    limits = limits or ArchiveLimits()
+    if location.is_dir():
+        return _FolderArchive(location, limits)
+    if location.is_file():
+        return _ZipArchive(location, limits)
+    raise ArchiveError(
+        Finding("error", "not_found", location.name, "is neither a folder nor a file", "give the path of a scan")
+    )
+
+
+class _ZipArchive(ScanArchive):
+    def __init__(self, path: Path, limits: ArchiveLimits) -> None:
+        self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            extents = read_directory(self._descriptor, path.name, limits)
+        except BaseException:
+            self.close()
+            raise
+        self._extents: dict[str, Extent] = extents
+        self._reader = RangeReader(self._descriptor)
+        super().__init__(path, {name: extent.size for name, extent in extents.items()})
+
+    def close(self) -> None:
+        descriptor, self._descriptor = self._descriptor, -1
+        if descriptor >= 0:
+            os.close(descriptor)
+
+    def _stream(self, name: str) -> io.RawIOBase:
+        return MemberStream(self._descriptor, self._extents[name])
+
+    def _range(self, name: str, offset: int, length: int) -> bytes:
+        return self._reader.read(self._extents[name], offset, length)
+
+
+class _FolderArchive(ScanArchive):
+    def __init__(self, path: Path, limits: ArchiveLimits) -> None:
+        self._root = path.resolve()
+        problems = Findings()
+        sizes: dict[str, int] = {}
+        for name, size in _walk(self._root, path.name, limits, problems):
+            sizes[name] = size
+        if sum(sizes.values()) > limits.total_bytes:
+            message = f"holds more than {limits.total_bytes} bytes"
+            problems.error("archive_too_large", path.name, message, "split the scan")
+        raise_errors(problems)
+        super().__init__(path, sizes)
+
+    def close(self) -> None:
+        """A folder holds nothing open."""
+
+    def _stream(self, name: str) -> io.RawIOBase:
+        return self._open(name)
+
+    def _range(self, name: str, offset: int, length: int) -> bytes:
+        with self._open(name) as stream:
+            stream.seek(offset)
+            data = stream.read(length)
+        if len(data) != length:
+            message = "has become shorter while it was read"
+            raise ArchiveError(Finding("error", "truncated_file", name, message, "wait until the scan is written"))
+        return data
+
+    def _open(self, name: str) -> io.FileIO:
+        path = self._root / name
+        try:
+            if not path.resolve(strict=True).is_relative_to(self._root):
+                raise ArchiveError(_leaves(name))
+            return io.FileIO(path, "rb")
+        except OSError as error:
+            message = f"cannot be read ({error.strerror})"
+            raise ArchiveError(Finding("error", "unreadable_file", name, message, "check its permissions")) from error
+
+
+def _leaves(name: str) -> Finding:
+    return Finding("error", "link_or_device", name, "is a link that leaves the scan", "copy the file into the folder")
+
+
+def _walk(root: Path, label: str, limits: ArchiveLimits, problems: Findings) -> list[tuple[str, int]]:
+    """Names and sizes of all plain files below `root`; links are followed only to files inside it."""
+    found: list[tuple[str, int]] = []
+    for folder, subfolders, files in os.walk(root, onerror=_unreadable_folder):
+        base = Path(folder)
+        for entry in [*files, *(name for name in subfolders if (base / name).is_symlink())]:
+            path = base / entry
+            name = path.relative_to(root).as_posix()
+            if is_junk(name):
+                continue
+            if len(found) >= limits.entries:
+                raise too_many_entries(label, limits)
+            found.append((name, _checked_size(root, path, name, limits, problems)))
+    return found
+
+
+def _unreadable_folder(error: OSError) -> None:
+    finding = Finding(
+        "error", "unreadable_file", Path(str(error.filename)).name, "cannot be listed", "check permissions"
+    )
+    raise ArchiveError(finding) from error
+
+
+def _checked_size(root: Path, path: Path, name: str, limits: ArchiveLimits, problems: Findings) -> int:
+    shown = repr(name)[1:-1][:200]
+    reason = unsafe_reason(name)
+    if reason:
+        problems.error("unsafe_name", shown, reason, "use plain relative names")
+    if is_nested_archive(name):
+        problems.error("nested_archive", shown, "is an archive inside the scan", "unpack it, or leave it out")
+    try:
+        if path.is_symlink() and not path.resolve(strict=True).is_relative_to(root):
+            problems.add(_leaves(shown))
+            return 0
+        status = path.stat()
+    except (OSError, RuntimeError):
+        problems.error("unreadable_file", shown, "is a broken link or cannot be read", "replace it by a plain file")
+        return 0
+    if not stat.S_ISREG(status.st_mode):
+        problems.error("link_or_device", shown, "is a linked folder or special file", "replace it by plain files")
+    if status.st_size > limits.member_bytes:
+        message = f"is larger than {limits.member_bytes} bytes"
+        problems.error("member_too_large", shown, message, "leave it out or split the scan")
+    return status.st_size

@@ -1,0 +1,246 @@
+"""advtex's own layout: `scan.json` beside the files that it names. Every path is relative to `scan.json`.
+
+    {
+      "version": 1,
+      "kind": "object" | "scene",                  optional, default "scene"
+      "up_axis": "+x" | "-x" | ... | "-z",         optional, default "+z"; the world direction that points up
+      "depth_scale": 1000,                         optional; stored depth units per metre; 0 and 65535 are no reading
+      "color_intrinsics": INTRINSICS,              here or in each frame
+      "depth_intrinsics": INTRINSICS,              here or in each frame, where frames have depth
+      "depth_to_color": MATRIX,                    optional; depth-camera to color-camera coordinates
+      "mesh": "mesh.ply",
+      "frames": [
+        {
+          "name": "000000",                        optional, default the frame's number in six digits; orders the frames
+          "color": "color/0.jpg",
+          "depth": "depth/0.png",                  optional; 16-bit gray PNG
+          "camera_to_world": MATRIX,               of the color camera; OpenCV axes, metres
+          "color_intrinsics": INTRINSICS,          optional, in place of the common ones
+          "depth_intrinsics": INTRINSICS           likewise
+        }
+      ]
+    }
+
+INTRINSICS is {"fx", "fy", "cx", "cy", "width", "height"} in pixels; the centre of the first pixel is (0.5, 0.5).
+MATRIX is 4 rows of 4 numbers, or the same 16 numbers in one list. A pose of only NaN or infinities drops its frame;
+since JSON has no such numbers, null is read as NaN.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Any, cast, get_args
+
+from advtex_scan.archive import ScanArchive
+from advtex_scan.errors import ScanFormatError
+from advtex_scan.layouts._reader import Match, ScanReader
+from advtex_scan.manifest import (
+    IDENTITY,
+    FrameEntry,
+    Intrinsics,
+    Matrix4,
+    MeshEntry,
+    ScanKind,
+    ScanManifest,
+    UpAxis,
+)
+from advtex_scan.matrices import matrix4, pose_problem
+
+NAME = "native"
+FILE = "scan.json"
+VERSION = 1
+JSON_LIMIT = 64 << 20
+SCAN_KEYS = frozenset(
+    [
+        "version",
+        "kind",
+        "up_axis",
+        "depth_scale",
+        "color_intrinsics",
+        "depth_intrinsics",
+        "depth_to_color",
+        "mesh",
+        "frames",
+    ]
+)
+FRAME_KEYS = frozenset(["name", "color", "depth", "camera_to_world", "color_intrinsics", "depth_intrinsics"])
+INTRINSICS_KEYS = ("fx", "fy", "cx", "cy", "width", "height")
+Json = Mapping[str, Any]
+
+
+def detect(archive: ScanArchive) -> Match | None:
+    """A `scan.json` beside or above everything else."""
+    return Match(1.0, f"{FILE} is there") if FILE in archive else None
+
+
+def read(reader: ScanReader) -> ScanManifest | None:
+    """The manifest that `scan.json` describes; None if it is no JSON object of version 1."""
+    scan = _load(reader)
+    if scan is None:
+        return None
+    _unknown_keys(reader, scan, SCAN_KEYS, FILE)
+    frames = scan.get("frames")
+    if not isinstance(frames, list):
+        reader.findings.error("bad_value", f"{FILE}: frames", "is missing or no list", "list the frames")
+        frames = []
+    common = {kind: _intrinsics(reader, scan.get(kind), kind) for kind in ("color_intrinsics", "depth_intrinsics")}
+    reader.frames_found = len(frames)
+    entries = [_frame(reader, frame, index, common) for index, frame in enumerate(frames)]
+    depth_to_color = IDENTITY
+    if scan.get("depth_to_color") is not None:
+        depth_to_color = _rigid(reader, scan["depth_to_color"], "depth_to_color") or IDENTITY
+    return ScanManifest(
+        layout=NAME,
+        frames=tuple(sorted((entry for entry in entries if entry), key=lambda entry: entry.name)),
+        mesh=_mesh(reader, scan.get("mesh")),
+        kind=cast(ScanKind, _choice(reader, scan, "kind", "scene", get_args(ScanKind))),
+        up_axis=cast(UpAxis, _choice(reader, scan, "up_axis", "+z", get_args(UpAxis))),
+        depth_scale=_positive(reader, scan.get("depth_scale", 1000.0), "depth_scale"),
+        depth_to_color=depth_to_color,
+    )
+
+
+def _load(reader: ScanReader) -> Json | None:
+    reader.used.add(FILE)
+    try:
+        scan = json.loads(reader.archive.read(FILE, JSON_LIMIT))
+    except ScanFormatError as error:
+        reader.findings.extend(error.findings)
+        return None
+    except (ValueError, RecursionError) as error:
+        reader.findings.error("bad_json", FILE, f"is not valid JSON ({error})", "write it with a JSON library")
+        return None
+    if not isinstance(scan, dict):
+        reader.findings.error("bad_json", FILE, "does not hold a JSON object", "see the documented layout")
+        return None
+    if scan.get("version") != VERSION:
+        message = f"states version {scan.get('version')!r}; this program reads version {VERSION}"
+        reader.findings.error("bad_version", FILE, message, f'write "version": {VERSION}')
+        return None
+    return scan
+
+
+def _frame(reader: ScanReader, frame: Any, index: int, common: Mapping[str, Intrinsics | None]) -> FrameEntry | None:
+    where = f"{FILE}: frames[{index}]"
+    if not isinstance(frame, dict):
+        reader.findings.error("bad_value", where, "is no object", "give color and camera_to_world")
+        return None
+    _unknown_keys(reader, frame, FRAME_KEYS, where)
+    color = _path(reader, frame.get("color"), f"{where}.color")
+    depth = None if frame.get("depth") is None else _path(reader, frame["depth"], f"{where}.depth")
+    pose = _pose(reader, frame.get("camera_to_world"), f"{where}.camera_to_world")
+    own = {
+        kind: _intrinsics(reader, frame.get(kind), f"frames[{index}].{kind}") if kind in frame else common[kind]
+        for kind in common
+    }
+    if own["color_intrinsics"] is None and frame.get("color_intrinsics") is None:
+        remedy = "give color_intrinsics once at the top or in each frame"
+        reader.findings.error("no_color_intrinsics", where, "has no color_intrinsics", remedy)
+    name = frame.get("name", f"{index:06d}")
+    if not isinstance(name, str) or not name.isprintable() or not 0 < len(name) <= 200:
+        reader.findings.error("bad_value", f"{where}.name", "is no printable text", "give each frame a short name")
+        return None
+    if color is None or pose is None or own["color_intrinsics"] is None:
+        return None
+    return FrameEntry(name, color, depth, pose, own["color_intrinsics"], own["depth_intrinsics"])
+
+
+def _unknown_keys(reader: ScanReader, value: Json, known: frozenset[str], where: str) -> None:
+    unknown = sorted(str(key)[:40] for key in value if key not in known)
+    if unknown:
+        message = f"has unknown keys, which are ignored: {', '.join(unknown[:5])}"
+        reader.findings.warning("unknown_key", where, message, "correct the spelling or remove them")
+
+
+def _path(reader: ScanReader, value: Any, where: str) -> str | None:
+    if not isinstance(value, str) or not value:
+        reader.findings.error("bad_value", where, "is missing or no path", "give a path relative to scan.json")
+        return None
+    name = value.removeprefix("./")
+    if name not in reader.archive:
+        message = f"names {name[:200]!r}, which is not in the scan"
+        reader.findings.error("missing_file", where, message, "add the file or correct the path")
+        return None
+    reader.used.add(name)
+    return name
+
+
+def _mesh(reader: ScanReader, value: Any) -> MeshEntry | None:
+    if value is None:
+        return None  # the check reports it
+    path = _path(reader, value, f"{FILE}: mesh")
+    return MeshEntry(path) if path else None
+
+
+def _numbers(value: Any) -> list[float] | None:
+    """16 numbers from a flat or nested list; null becomes NaN."""
+    if isinstance(value, list) and len(value) == 4 and all(isinstance(row, list) for row in value):
+        value = [number for row in value for number in row]
+    if not isinstance(value, list) or len(value) != 16:
+        return None
+    numbers = [math.nan if number is None else _number(number) for number in value]
+    return None if None in numbers else cast(list[float], numbers)
+
+
+def _number(value: Any) -> float | None:
+    """A JSON number as a float; None for anything else, integers beyond the floats included."""
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return None
+    try:
+        return float(value)
+    except OverflowError:
+        return None
+
+
+def _pose(reader: ScanReader, value: Any, where: str) -> Matrix4 | None:
+    if value is None:
+        reader.drop("missing_pose", where, "is missing; the frame is left out", "give the frame's camera_to_world")
+        return None
+    numbers = _numbers(value)
+    if numbers is None:
+        reader.findings.error("bad_value", where, "is no 4x4 matrix", "give 4 rows of 4 numbers")
+        return None
+    return reader.pose(numbers, where)
+
+
+def _rigid(reader: ScanReader, value: Any, key: str) -> Matrix4 | None:
+    numbers = _numbers(value)
+    problem = pose_problem(matrix4(numbers)) if numbers else "is no 4x4 matrix"
+    if numbers is None or problem:
+        message = str(problem).replace("the pose", "the transform")
+        reader.findings.error("bad_transform", f"{FILE}: {key}", message, "give a rigid 4x4 matrix")
+        return None
+    return matrix4(numbers)
+
+
+def _intrinsics(reader: ScanReader, value: Any, key: str) -> Intrinsics | None:
+    if value is None:
+        return None
+    where = f"{FILE}: {key}"
+    numbers = [_number(value.get(name)) for name in INTRINSICS_KEYS] if isinstance(value, dict) else [None]
+    sizes = numbers[4:]
+    if None in numbers or not all(size and size.is_integer() and 0 < size < 1 << 20 for size in sizes):
+        remedy = "give fx, fy, cx, cy, width and height in pixels"
+        reader.findings.error("bad_intrinsics", where, "is no camera", remedy)
+        return None
+    fx, fy, cx, cy, width, height = cast(list[float], numbers)
+    return reader.intrinsics((fx, fy, cx, cy), (int(width), int(height)), where)
+
+
+def _choice(reader: ScanReader, scan: Json, key: str, default: str, allowed: tuple[str, ...]) -> str:
+    value = scan.get(key, default)
+    if value in allowed:
+        return str(value)
+    remedy = f"choose one of {', '.join(allowed)}"
+    reader.findings.error("bad_value", f"{FILE}: {key}", f"{str(value)[:40]!r} is unknown", remedy)
+    return default
+
+
+def _positive(reader: ScanReader, value: Any, key: str) -> float:
+    number = _number(value)
+    if number is not None and math.isfinite(number) and number > 0:
+        return number
+    reader.findings.error("bad_value", f"{FILE}: {key}", "is no positive number", "1000 stands for millimetres")
+    return 1000.0

@@ -1,0 +1,60 @@
+"""4x4 rigid transforms as nested tuples, and the test that a pose is one. Rows first; points are columns."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import cast
+
+from advtex_scan.manifest import Matrix4
+
+ROTATION_TOLERANCE = 0.01  # largest entry of |R Rᵀ - I|; six printed digits (ScanNet) give about 1e-6
+
+
+def matrix4(values: Sequence[float]) -> Matrix4:
+    """A matrix from 16 numbers, row by row, or from the 12 of its upper three rows."""
+    full = [*values, 0.0, 0.0, 0.0, 1.0] if len(values) == 12 else list(values)
+    assert len(full) == 16
+    return cast(Matrix4, tuple(tuple(float(value) for value in full[row : row + 4]) for row in range(0, 16, 4)))
+
+
+def compose(a: Matrix4, b: Matrix4) -> Matrix4:
+    """a @ b: first b, then a."""
+    columns = list(zip(*b, strict=True))
+    rows = [[sum(x * y for x, y in zip(row, column, strict=True)) for column in columns] for row in a]
+    return matrix4([value for row in rows for value in row])
+
+
+def invert_rigid(transform: Matrix4) -> Matrix4:
+    """Inverse of a rotation and translation: Rᵀ, -Rᵀ t."""
+    rotation = [row[:3] for row in transform[:3]]
+    shift = [row[3] for row in transform[:3]]
+    values: list[float] = []
+    for column in zip(*rotation, strict=True):
+        values += [*column, -sum(x * y for x, y in zip(column, shift, strict=True))]
+    return matrix4(values)
+
+
+def pose_problem(transform: Matrix4) -> str | None:
+    """Why a matrix is no rigid transform, None if it is one within ROTATION_TOLERANCE."""
+    if not all(math.isfinite(value) for row in transform for value in row):
+        return "the pose holds NaN or infinite numbers"
+    if any(abs(x - y) > 1e-3 for x, y in zip(transform[3], (0, 0, 0, 1), strict=True)):
+        return f"the last row of the pose is {list(transform[3])}, not 0 0 0 1"
+    r0, r1, r2 = (row[:3] for row in transform[:3])
+    off = max(abs(_dot(a, b) - (a is b)) for a in (r0, r1, r2) for b in (r0, r1, r2))
+    if not off <= ROTATION_TOLERANCE:
+        return f"the pose is not a rotation: R Rᵀ is off the identity by {off:.3g} (at most {ROTATION_TOLERANCE})"
+    cross = (r0[1] * r1[2] - r0[2] * r1[1], r0[2] * r1[0] - r0[0] * r1[2], r0[0] * r1[1] - r0[1] * r1[0])
+    if _dot(cross, r2) < 0:
+        return "the pose mirrors: its determinant is -1, not 1"
+    return None
+
+
+def is_lost(transform: Matrix4) -> bool:
+    """True for the mark of lost tracking (ScanNet, BundleFusion): nothing in the upper rows is finite."""
+    return not any(math.isfinite(value) for row in transform[:3] for value in row)
+
+
+def _dot(a: Sequence[float], b: Sequence[float]) -> float:
+    return sum(x * y for x, y in zip(a, b, strict=True))

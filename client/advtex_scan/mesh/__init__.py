@@ -1,0 +1,25 @@
+"""Structural reading of mesh files: counts, indices, bounds; enough to refuse what cannot be textured.
+
+Counts are checked against the file's size before anything is allocated for them.
+"""
+
+from __future__ import annotations
+
+from advtex_scan.archive import ScanArchive
+from advtex_scan.errors import MeshError
+from advtex_scan.mesh._ply import read_ply
+from advtex_scan.mesh._surface import MeshFacts, MeshSurface, broken, finish
+
+__all__ = ["MeshFacts", "MeshSurface", "read_mesh"]
+
+
+def read_mesh(archive: ScanArchive, path: str) -> MeshSurface:
+    """Positions and triangles of a `.ply`, `.obj`, `.glb` or `.gltf`.
+
+    Raises MeshError with every problem: no faces, indices out of range, NaN or infinite vertices, no face with an area,
+    counts that disagree with the file's size, unsupported compression.
+    """
+    suffix = path.lower().rsplit(".", 1)[-1]
+    if suffix == "ply":
+        return finish(read_ply(archive, path), path)
+    raise MeshError(broken(path, "is of no known kind", "convert it to PLY, OBJ or GLB"))

@@ -1,0 +1,259 @@
+"""Synthetic scans with known truth: photographs of the synthetic object, with the errors that real scans have.
+
+A scan in the native layout, plus `truth/`, which scan readers ignore:
+
+    scan.json  color/*.png  depth/*.png  mesh.ply
+    truth/object.obj .mtl .png      the object as it is
+    truth/cameras.json              the poses as they were, of the frames and of the held-out views
+    truth/heldout/*.png             views from other places, without noise, exposure changes or camera errors
+
+The errors are those of the paper's supplement ("Details for Synthetic 3D Data Generation"): each camera is moved by a
+translation uniform in [-e_t, e_t] per axis and turned by Euler angles uniform in [-e_a, e_a]; each vertex gets a scalar
+uniform in [-e_g, e_g], smoothed by three Laplacian steps, and moves by it along its normal.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from advtex_engine import synthetic_object
+from advtex_engine.cameras import camera_to_world
+from advtex_engine.export import export_model, vertex_normals
+from advtex_engine.previews import render_view
+from advtex_engine.rasterize import rasterize
+from advtex_engine.scene import Camera, Mesh
+
+CAMERA_ERROR = 0.003
+"""e_t in metres. At half a metre this shifts the image by up to 2 pixels of a 320x240 frame per axis, and the turn that
+goes with it as much again: two frames disagree by 2 to 6 pixels, as those of real scans do (3 to 20 mm at 2 to 3 m)."""
+GEOMETRY_ERROR = 0.006
+"""e_g in metres: 2 % of the object's 0.3 m, the least of the paper's. Smoothing leaves about 1 mm."""
+LAPLACIAN_STEPS = 3
+TARGET = (0.0, 0.0, 0.085)
+"""Where the cameras look, metres."""
+DISTANCE = 0.5
+"""Mean distance of the cameras, metres."""
+RINGS = ((14.0, 0.40), (34.0, 0.35), (58.0, 0.25))
+"""Elevation in degrees and share of the views of each ring."""
+FOCAL = 1.05
+"""Focal length over the image's width: a phone's field of view."""
+SUPERSAMPLE = 3
+EXPOSURE_SPREAD = 0.04
+"""Standard deviation of the frames' exposure, in stops times ln 2."""
+SENSOR_NOISE = 1.5
+"""Standard deviation in gray levels of 255."""
+DEPTH_NOISE = 0.001
+"""Standard deviation in metres."""
+DEPTH_SCALE = 1000.0
+HELDOUT_VIEWS = 8
+BACKDROP = 0.8
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A view of the synthetic scan: the camera as it was, and its place in the scan."""
+
+    name: str
+    camera: Camera
+
+
+def synthesize(
+    out: Path,
+    *,
+    views: int = 60,
+    width: int = 320,
+    height: int = 240,
+    seed: int = 0,
+    camera_error: float = CAMERA_ERROR,
+    geometry_error: float = GEOMETRY_ERROR,
+) -> None:
+    """Write a synthetic scan: a zip when `out` ends in .zip, else a folder, which is replaced if it is one of these.
+
+    views: frames of width x height pixels. camera_error: e_t in metres; e_a is the angle that moves the image as far
+    (e_t / DISTANCE). geometry_error: e_g in metres. The same arguments make the same scan.
+    """
+    assert views >= 3 and width >= 16 and height >= 16
+    with tempfile.TemporaryDirectory(prefix="advtex-synthesize-", dir=out.resolve().parent) as work:
+        folder = Path(work) / "scan"
+        _write_scan(folder, views, width, height, seed, camera_error, geometry_error)
+        if out.suffix == ".zip":
+            archive = Path(work) / "scan.zip"
+            _zip_folder(folder, archive)
+            archive.replace(out)
+            return
+        if out.exists():
+            if not (out / "truth" / "cameras.json").is_file() and any(out.iterdir()):
+                raise FileExistsError(f"{out} exists and is not a synthetic scan; choose another folder or remove it")
+            shutil.rmtree(out)
+        folder.rename(out)
+
+
+def _write_scan(
+    folder: Path, views: int, width: int, height: int, seed: int, camera_error: float, geometry_error: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    atlas, texture = synthetic_object.build(seed)
+    for name in ("color", "depth", "truth/heldout"):
+        (folder / name).mkdir(parents=True)
+    shots = _shots(views, width, height, rng, "frame")
+    frames = []
+    for shot in shots:
+        clean = render_view(atlas, texture, shot.camera, supersample=SUPERSAMPLE, background=BACKDROP)
+        _write_png(folder / f"color/{shot.name}.png", _exposed(clean.numpy(), rng))
+        depth = rasterize(atlas.mesh, shot.camera).depth.numpy()
+        _write_png(folder / f"depth/{shot.name}.png", _measured(depth, rng))
+        estimated = _misplaced(camera_to_world(shot.camera).numpy(), camera_error, rng)
+        frames.append(
+            {
+                "name": shot.name,
+                "color": f"color/{shot.name}.png",
+                "depth": f"depth/{shot.name}.png",
+                "camera_to_world": estimated.tolist(),
+            }
+        )
+    _write_ply(folder / "mesh.ply", _bent(atlas.mesh, geometry_error, rng))
+    scan = {
+        "version": 1,
+        "kind": "object",
+        "up_axis": "+z",
+        "depth_scale": DEPTH_SCALE,
+        "color_intrinsics": _intrinsics(shots[0].camera),
+        "depth_intrinsics": _intrinsics(shots[0].camera),
+        "mesh": "mesh.ply",
+        "frames": frames,
+    }
+    (folder / "scan.json").write_text(json.dumps(scan, indent=1))
+
+    heldout = _shots(HELDOUT_VIEWS, width, height, np.random.default_rng([seed, 1]), "heldout", turn=0.37)
+    for shot in heldout:
+        clean = render_view(atlas, texture, shot.camera, supersample=SUPERSAMPLE, background=BACKDROP)
+        _write_png(folder / f"truth/heldout/{shot.name}.png", np.rint(clean.numpy() * 255).astype(np.uint8))
+    export_model(folder / "truth", atlas, texture, up_axis="+z", name="object")
+    truth = {
+        "color_intrinsics": _intrinsics(shots[0].camera),
+        "frames": [_pose(shot) for shot in shots],
+        "heldout": [_pose(shot) for shot in heldout],
+    }
+    (folder / "truth/cameras.json").write_text(json.dumps(truth, indent=1))
+
+
+def _shots(count: int, width: int, height: int, rng: np.random.Generator, prefix: str, turn: float = 0.0) -> list[Shot]:
+    """Cameras on rings of a hemisphere, a little off them, looking at the object; in order along each ring."""
+    focal = FOCAL * width
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
+    ends = np.rint(np.cumsum([share for _, share in RINGS]) * count).astype(int)
+    shots = []
+    for index in range(count):
+        ring = int(np.searchsorted(ends, index, side="right"))
+        first = int(ends[ring - 1]) if ring else 0
+        around = (index - first + turn + rng.uniform(-0.2, 0.2)) / max(int(ends[ring]) - first, 1)
+        azimuth = 2 * np.pi * around + 0.5 * ring
+        elevation = np.radians(RINGS[ring][0] + rng.uniform(-4, 4))
+        distance = DISTANCE * rng.uniform(0.8, 1.15)
+        towards = [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+        target = np.array(TARGET) + rng.uniform(-0.015, 0.015, 3)
+        world_to_camera = synthetic_object.look_at(np.array(TARGET) + distance * np.array(towards), target)
+        camera = Camera(K, torch.from_numpy(world_to_camera), width, height)
+        shots.append(Shot(f"{prefix}-{index:04d}", camera))
+    return shots
+
+
+def _exposed(image: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """The photograph of a clean image: another exposure, white balance within 1 %, sensor noise; [H,W,3] uint8."""
+    gain = np.exp(EXPOSURE_SPREAD * rng.standard_normal() + 0.01 * rng.standard_normal(3))
+    # Gain acts on light, of which sRGB values are about the 2.2nd root.
+    levels = 255 * image * gain ** (1 / 2.2) + SENSOR_NOISE * rng.standard_normal(image.shape)
+    return np.rint(np.clip(levels, 0, 255)).astype(np.uint8)
+
+
+def _measured(depth: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint16]:
+    """Depth as a sensor stores it: noisy, in units of 1/DEPTH_SCALE metres, 0 where nothing was hit."""
+    noisy = depth + DEPTH_NOISE * rng.standard_normal(depth.shape)
+    return np.where(depth > 0, np.rint(noisy * DEPTH_SCALE), 0).astype(np.uint16)
+
+
+def _misplaced(camera_to_world: NDArray[np.float64], error: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """The pose with the paper's camera errors, turned about the camera's own centre."""
+    translation = rng.uniform(-error, error, 3)
+    x, y, z = rng.uniform(-1, 1, 3) * error / DISTANCE
+    turn = _axis_turn(2, z) @ _axis_turn(1, y) @ _axis_turn(0, x)
+    moved = camera_to_world.copy()
+    moved[:3, :3] = moved[:3, :3] @ turn
+    moved[:3, 3] += translation
+    return moved
+
+
+def _axis_turn(axis: int, angle: float) -> NDArray[np.float64]:
+    turn = np.eye(3)
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    turn[first, first] = turn[second, second] = np.cos(angle)
+    turn[first, second], turn[second, first] = -np.sin(angle), np.sin(angle)
+    return turn
+
+
+def _bent(mesh: Mesh, error: float, rng: np.random.Generator) -> Mesh:
+    """The mesh with the paper's geometry errors and without its texture coordinates."""
+    faces = mesh.t_pos_idx
+    count = len(mesh.v_pos)
+    edges = torch.cat((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
+    edges = torch.unique(torch.cat((edges, edges.flip(1))), dim=0)
+    degree = torch.zeros(count).index_add_(0, edges[:, 0], torch.ones(len(edges)))
+    offset = torch.from_numpy(rng.uniform(-error, error, count).astype(np.float32))
+    for _ in range(LAPLACIAN_STEPS):
+        offset = torch.zeros(count).index_add_(0, edges[:, 0], offset[edges[:, 1]]) / degree.clamp(min=1)
+    return Mesh(mesh.v_pos + offset[:, None] * vertex_normals(mesh), faces)
+
+
+def _intrinsics(camera: Camera) -> dict[str, float | int]:
+    K = camera.K
+    return {
+        "fx": float(K[0, 0]),
+        "fy": float(K[1, 1]),
+        "cx": float(K[0, 2]),
+        "cy": float(K[1, 2]),
+        "width": camera.width,
+        "height": camera.height,
+    }
+
+
+def _pose(shot: Shot) -> dict[str, Any]:
+    return {"name": shot.name, "camera_to_world": camera_to_world(shot.camera).tolist()}
+
+
+def _write_png(path: Path, image: NDArray[Any]) -> None:
+    done, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
+    assert done
+    path.write_bytes(data.tobytes())
+
+
+def _write_ply(path: Path, mesh: Mesh) -> None:
+    """Binary little-endian PLY."""
+    faces = np.empty(len(mesh.t_pos_idx), dtype=[("count", "u1"), ("index", "<i4", 3)])
+    faces["count"], faces["index"] = 3, mesh.t_pos_idx.numpy()
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        f"element vertex {len(mesh.v_pos)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    path.write_bytes(header.encode() + mesh.v_pos.numpy().astype("<f4").tobytes() + faces.tobytes())
+
+
+def _zip_folder(folder: Path, archive: Path) -> None:
+    """Store the folder's files in sorted order with fixed times, so that the same scan gives the same bytes."""
+    with zipfile.ZipFile(archive, "w") as file:
+        for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+            entry = zipfile.ZipInfo(path.relative_to(folder).as_posix())
+            packed = path.suffix in {".json", ".ply", ".obj", ".mtl"}
+            entry.compress_type = zipfile.ZIP_DEFLATED if packed else zipfile.ZIP_STORED
+            file.writestr(entry, path.read_bytes())

@@ -21,7 +21,8 @@ DEPTH_TOLERANCE = 0.1
 def face_areas(mesh: Mesh) -> Tensor:
     """[T] float64, square metres."""
     a, b, c = mesh.v_pos.double()[mesh.t_pos_idx].unbind(1)
-    return torch.linalg.cross(b - a, c - a).norm(dim=1) / 2
+    area: Tensor = torch.linalg.vector_norm(torch.linalg.cross(b - a, c - a), dim=1) / 2
+    return area
 
 
 def pixel_density(mesh: Mesh, cameras: Sequence[Camera]) -> Tensor:

@@ -91,11 +91,10 @@ def decimate(mesh: Mesh, face_budget: int, monitor: Monitor) -> Mesh:
 def _has_area(position: npt.NDArray[np.float32], faces: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
     corners = position.astype(np.float64)[faces]
     finite = np.isfinite(corners).all(axis=(1, 2))
-    a, b, c = (np.where(finite[:, None], corners[:, k], 0.0) for k in range(3))
+    a, b, c = np.moveaxis(np.where(finite[:, None, None], corners, 0.0), 1, 0)
     double_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     longest = np.maximum.reduce([((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))])
-    kept: npt.NDArray[np.bool_] = finite & (double_area > MIN_RELATIVE_HEIGHT * longest)
-    return kept
+    return np.asarray(finite & (double_area > MIN_RELATIVE_HEIGHT * longest), dtype=np.bool_)
 
 
 def _unique_rows(rows: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:

@@ -15,47 +15,22 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from advtex_engine.errors import Problem, ScanError
+from advtex_engine.gltf import read_gltf
+from advtex_engine.polygons import MeshFormatError, Polygons, flip_v, triangulate
 from advtex_engine.scene import Mesh
 from advtex_scan.archive import ScanArchive
 
 MAX_MESH_BYTES = 1 << 30
-MAX_FACES = 10_000_000
-EXPORT_AGAIN = "export the mesh again as PLY, OBJ or GLB"
-
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class Polygons:
-    """What a mesh file holds, before checks.
-
-    position  [V,3] world
-    corners   [C] indices into position, the corners of all faces one after the other
-    sizes     [F] corners per face
-    uv        [U,2] scene.py's convention, or None
-    uv_corners [C] indices into uv, or None
-    """
-
-    position: Floats
-    corners: Integers
-    sizes: Integers
-    uv: Floats | None = None
-    uv_corners: Integers | None = None
-
-
-class MeshFormatError(ValueError):
-    """The bytes are not what the format says; the message completes "the mesh ..."."""
+EXPORT_AGAIN = "export the mesh again as PLY, OBJ or GLB, in triangles and without compression"
 
 
 def load_mesh(archive: ScanArchive, path: str) -> Mesh:
     """Read the mesh file `path` of a scan; polygons become triangle fans, in file order.
 
     Raises ScanError, naming the file and the remedy, for a file that is broken, too large or of another format, and
-    for NaN coordinates, indices out of range or a mesh without faces.
+    for coordinates that are not finite, indices out of range or a mesh without faces.
     """
     data = archive.read(path, MAX_MESH_BYTES)
     suffix = PurePosixPath(path).suffix.lower()
@@ -64,50 +39,13 @@ def load_mesh(archive: ScanArchive, path: str) -> Mesh:
             polygons = read_ply(data)
         elif suffix == ".obj":
             polygons = read_obj(data)
+        elif suffix in (".glb", ".gltf"):
+            polygons = read_gltf(data, path, lambda name: archive.read(name, MAX_MESH_BYTES))
         else:
             raise MeshFormatError(f"has the ending {suffix!r}, which is not supported")
         return triangulate(polygons)
     except MeshFormatError as error:
         raise ScanError(Problem("bad_mesh", path, f"the mesh {error}", EXPORT_AGAIN)) from error
-
-
-def triangulate(polygons: Polygons) -> Mesh:
-    """Check indices and coordinates, and split every polygon into the fan around its first corner."""
-    position, corners, sizes = polygons.position, polygons.corners, polygons.sizes
-    if len(sizes) == 0 or not (sizes >= 3).any():
-        raise MeshFormatError("has no faces")
-    if int(np.maximum(sizes - 2, 0).sum()) > MAX_FACES:
-        raise MeshFormatError(f"has more than {MAX_FACES:,} faces")
-    _check_indices("face", corners, len(position))
-    triangles = np.maximum(sizes - 2, 0)
-    start = np.repeat(np.cumsum(sizes) - sizes, triangles)
-    step = np.arange(triangles.sum()) - np.repeat(np.cumsum(triangles) - triangles, triangles)
-    picks = np.stack([start, start + step + 1, start + step + 2], axis=1)
-    faces = corners[picks]
-    if not np.isfinite(position[faces]).all():
-        raise MeshFormatError("has coordinates that are not finite numbers")
-    v_pos = torch.from_numpy(position.astype(np.float32))
-    if not torch.isfinite(v_pos[faces]).all():
-        raise MeshFormatError("has coordinates beyond the range of single precision")
-    if polygons.uv is None or polygons.uv_corners is None:
-        return Mesh(v_pos, torch.from_numpy(faces))
-    _check_indices("texture coordinate", polygons.uv_corners, len(polygons.uv))
-    return Mesh(
-        v_pos,
-        torch.from_numpy(faces),
-        torch.from_numpy(polygons.uv.astype(np.float32)),
-        torch.from_numpy(polygons.uv_corners[picks]),
-    )
-
-
-def flip_v(uv: Floats) -> Floats:
-    """uv with v counted from the other end."""
-    return np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)
-
-
-def _check_indices(what: str, indices: Integers, count: int) -> None:
-    if len(indices) and not (indices.min() >= 0 and indices.max() < count):
-        raise MeshFormatError(f"has {what} indices out of range: {indices.min()} to {indices.max()} for {count}")
 
 
 # PLY ------------------------------------------------------------------------------------------------------------------

@@ -1,1 +1,17 @@
-"""One module per texturing method, behind one signature."""
+"""Texturing methods behind one signature: `Method`, from the view maps to a dense texture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from torch import Tensor
+
+from advtex_engine.methods.adversarial import adversarial
+from advtex_engine.methods.average import average
+from advtex_engine.methods.inputs import LossPoint, MethodInput
+
+Method = Callable[[MethodInput], tuple[Tensor, list[LossPoint]]]
+
+METHODS: dict[str, Method] = {"adversarial": adversarial, "average": average}
+
+__all__ = ["METHODS", "LossPoint", "Method", "MethodInput"]

@@ -1,0 +1,157 @@
+"""`advtex-engine texture|synthesize|compare|bench`: the engine alone, without a service."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+from advtex_engine.config import METHODS, PRESETS, TextureConfig
+from advtex_engine.errors import EngineError, OptionError, Problem, Stopped
+from advtex_engine.monitor import Monitor
+
+
+class _Terminal(Monitor):
+    """Prints stages and progress to stderr; the first SIGINT or SIGTERM asks for a stop with a checkpoint."""
+
+    def __init__(self) -> None:
+        self.stop = False
+        self.started = time.monotonic()
+        self.first: tuple[int, float] | None = None
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._ask)
+
+    def _ask(self, number: int, _frame: object) -> None:
+        self.stop = True
+        signal.signal(number, signal.SIG_DFL)
+
+    def stage_started(self, stage: str) -> None:
+        self._say(f"{stage} ...")
+
+    def stage_finished(self, stage: str, seconds: float, peak_memory_bytes: int) -> None:
+        self._say(f"{stage}: {seconds:.1f} s, peak memory {peak_memory_bytes / 2**20:.0f} MiB")
+
+    def progress(self, step: int, steps: int, losses: Mapping[str, float]) -> None:
+        now = time.monotonic()
+        first, since = self.first = self.first or (step, now)
+        rate = (step - first) / (now - since) if step > first else 0.0
+        left = f", {(steps - step) / rate:.0f} s left" if rate else ""
+        named = ", ".join(f"{name} {value:.3f}" for name, value in losses.items())
+        self._say(f"step {step}/{steps}: {named}{left}")
+
+    def warning(self, problem: Problem) -> None:
+        self._say(f"warning: {problem.where}: {problem.message} ({problem.remedy})")
+
+    def stop_requested(self) -> bool:
+        return self.stop
+
+    def _say(self, words: str) -> None:
+        print(f"[{time.monotonic() - self.started:7.1f} s] {words}", file=sys.stderr, flush=True)
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """"320x240" -> (320, 240)."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdigit() and height.isdigit()):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size; write WIDTHxHEIGHT, for example 320x240")
+    return int(width), int(height)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="advtex-engine", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    texture = commands.add_parser("texture", help="texture a scan (folder or zip)")
+    texture.add_argument("scan", type=Path)
+    texture.add_argument("-o", "--out", type=Path, required=True, help="folder for the result")
+    texture.add_argument("--preset", default="auto", choices=("auto", *PRESETS))
+    texture.add_argument("--method", default="adversarial", choices=METHODS)
+    texture.add_argument("--size", type=parse_size, help="working size of the views, WIDTHxHEIGHT")
+    texture.add_argument("--holdout", type=int, help="leave out the sorted frames whose position %% N == N // 2")
+    texture.add_argument("--steps", type=int, help="override the preset's step count")
+    texture.add_argument("--face-budget", type=int, default=TextureConfig.face_budget)
+    texture.add_argument("--max-texture-size", type=int, default=TextureConfig.max_texture_size)
+    texture.add_argument("--device", default="auto")
+    texture.add_argument("--seed", type=int, default=0)
+    texture.add_argument("--resume", action="store_true", help="go on from the checkpoint in OUT/work")
+    synthesize = commands.add_parser("synthesize", help="make a scan with known truth")
+    synthesize.add_argument("out", type=Path, help="folder, or file.zip")
+    synthesize.add_argument("--views", type=int, default=60)
+    synthesize.add_argument("--size", type=parse_size, default=(320, 240))
+    synthesize.add_argument("--seed", type=int, default=0)
+    compare = commands.add_parser("compare", help="score a result against the truth of a synthesized scan")
+    compare.add_argument("model", type=Path, help="model.obj")
+    compare.add_argument("scan", type=Path, help="the synthesized scan")
+    bench = commands.add_parser("bench", help="time one optimization step and its parts")
+    bench.add_argument("--device", default="auto")
+    bench.add_argument("--width", type=int, default=640)
+    bench.add_argument("--height", type=int, default=480)
+    bench.add_argument("--json", action="store_true", help="one line of JSON")
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs a command; exit codes: 0 done, 1 the input cannot be used, 2 usage, 130 stopped with a checkpoint."""
+    arguments = _parser().parse_args(argv)
+    try:
+        return _COMMANDS[arguments.command](arguments)
+    except Stopped as stopped:
+        print(f"advtex-engine: {stopped}", file=sys.stderr)
+        return 130
+    except OptionError as error:
+        print(f"advtex-engine: {error}", file=sys.stderr)
+        return 2
+    except EngineError as error:
+        print(f"advtex-engine: {error}", file=sys.stderr)
+        return 1
+
+
+def _texture(arguments: argparse.Namespace) -> int:
+    from advtex_engine.pipeline import texture_scan
+
+    names = ("preset", "method", "size", "holdout", "steps", "face_budget", "max_texture_size", "device", "seed")
+    config = TextureConfig(**{name: getattr(arguments, name) for name in names})
+    out: Path = arguments.out
+    result = texture_scan(
+        arguments.scan, out, config, work=out / "work", resume=arguments.resume, monitor=_Terminal()
+    )
+    for path in result.files:
+        print(path)
+    return 0
+
+
+def _synthesize(arguments: argparse.Namespace) -> int:
+    from advtex_engine.synthesize import synthesize
+
+    width, height = arguments.size
+    synthesize(arguments.out, views=arguments.views, width=width, height=height, seed=arguments.seed)
+    print(arguments.out)
+    return 0
+
+
+def _compare(arguments: argparse.Namespace) -> int:
+    from advtex_engine.synthesize import compare_to_truth
+
+    print(json.dumps(compare_to_truth(arguments.model, arguments.scan)))
+    return 0
+
+
+def _bench(arguments: argparse.Namespace) -> int:
+    from advtex_engine.bench import bench, print_table
+
+    result = bench(arguments.device, arguments.width, arguments.height)
+    if arguments.json:
+        print(json.dumps(result))
+    else:
+        print_table(result)
+    return 0
+
+
+_COMMANDS = {"texture": _texture, "synthesize": _synthesize, "compare": _compare, "bench": _bench}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

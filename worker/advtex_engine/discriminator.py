@@ -1,0 +1,49 @@
+"""The conditional PatchGAN discriminator (paper section 3.2, supplement figure "details")."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+RECEPTIVE_FIELD = 70
+PATCH_STRIDE = 8
+PATCH_OFFSET = -23  # the receptive field of logit (0, 0) starts this far outside the image
+MIN_SIZE = 24  # pixels per side that give one logit
+
+
+class PatchDiscriminator(nn.Module):
+    """Five 4x4 convolutions with padding 1: 6->64 s2, 64->128 s2, 128->128 s2, 128->128 s1, 128->1 s1.
+
+    Leaky ReLU 0.2 between them, no normalization, weights N(0, 0.02), biases zero: 664,001 parameters. Returns logits;
+    the paper's sigmoid is folded into the losses (softplus on logits is its stable equal).
+    """
+
+    def __init__(self, generator: torch.Generator | None = None) -> None:
+        super().__init__()
+        channels = (6, 64, 128, 128, 128, 1)
+        strides = (2, 2, 2, 1, 1)
+        self.convolutions = nn.ModuleList(
+            nn.Conv2d(channels[i], channels[i + 1], 4, stride, padding=1) for i, stride in enumerate(strides)
+        )
+        for layer in self.convolutions:
+            assert isinstance(layer, nn.Conv2d) and layer.bias is not None
+            nn.init.normal_(layer.weight, 0.0, 0.02, generator=generator)
+            nn.init.zeros_(layer.bias)
+
+    def forward(self, condition: Tensor, residual: Tensor) -> Tensor:
+        """condition I_A [B,3,H,W] and residual X - I_A [B,3,H,W] -> logits [B,1,H//8-2,W//8-2], one per 70x70 patch."""
+        assert condition.shape == residual.shape and condition.shape[1] == 3
+        assert min(condition.shape[-2:]) >= MIN_SIZE
+        x = torch.cat((condition, residual), 1).contiguous(memory_format=torch.channels_last)
+        for layer in self.convolutions[:-1]:
+            x = F.leaky_relu(layer(x), 0.2)
+        logits: Tensor = self.convolutions[-1](x)
+        return logits
+
+
+def patch_shares(mask: Tensor) -> Tensor:
+    """Share of each patch's receptive field, inside the image, that a mask [B,1,H,W] covers -> [B,1,H//8-2,W//8-2]."""
+    return F.avg_pool2d(
+        mask.to(torch.float32), RECEPTIVE_FIELD, PATCH_STRIDE, padding=-PATCH_OFFSET, count_include_pad=False
+    )

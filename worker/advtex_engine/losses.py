@@ -1,0 +1,55 @@
+"""The losses of both players, over the patches that count (paper sections 3.2 and 3.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from advtex_engine.discriminator import patch_shares
+
+MIN_FOREGROUND = 0.1  # patches with more than 90 % background are left out
+MIN_UNOCCLUDED = 0.5  # the discriminator learns from patches of which more than half is not occluded
+
+
+@dataclass(frozen=True)
+class PatchMasks:
+    """Weights (0 or 1) of the logits [B,1,h,w] in the texture's and in the discriminator's adversarial loss."""
+
+    texture: Tensor
+    discriminator: Tensor
+
+
+def patch_masks(foreground: Tensor, visible: Tensor) -> PatchMasks:
+    """The paper's two rules, from the logits' exact receptive fields (the part inside the image).
+
+    foreground: [B,1,H,W], pixels where the source view sees the mesh. visible: [B,1,H,W], those of them that the
+    auxiliary view sees as well.
+    """
+    shares = patch_shares(torch.cat((foreground, visible), 1).to(torch.float32))
+    inside, seen = shares[:, :1], shares[:, 1:]
+    texture = (inside >= MIN_FOREGROUND).to(torch.float32)
+    return PatchMasks(texture, texture * (seen > MIN_UNOCCLUDED * inside))
+
+
+def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Mean of values where mask is 1; 0 where the mask is empty. Mask broadcasts over values' channels."""
+    channels = values.numel() // mask.numel()
+    return (values * mask).sum() / (mask.sum() * channels).clamp(min=1.0)
+
+
+def discriminator_loss(real: Tensor, fake: Tensor, mask: Tensor) -> Tensor:
+    """-log D(real) - log(1 - D(fake)) over the discriminator's patches; real, fake: logits [B,1,h,w]."""
+    return masked_mean(F.softplus(-real) + F.softplus(fake), mask)
+
+
+def adversarial_loss(fake: Tensor, mask: Tensor) -> Tensor:
+    """Non-saturating loss of the texture, -log D(fake), over the patches that count."""
+    return masked_mean(F.softplus(-fake), mask)
+
+
+def l1_loss(fake: Tensor, real: Tensor, visible: Tensor) -> Tensor:
+    """Mean absolute difference to the warped auxiliary image where it is visible; images [B,3,H,W]."""
+    return masked_mean((fake - real).abs(), visible)

@@ -1,0 +1,105 @@
+"""The adversarial method over its coarse-to-fine levels, with checkpoints (paper section 3; presets in config.py)."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from advtex_engine.checkpoint import CHECKPOINT, CheckpointTimer
+from advtex_engine.discriminator import PatchDiscriminator
+from advtex_engine.errors import Stopped
+from advtex_engine.methods.average import dense_texture
+from advtex_engine.methods.inputs import LossPoint, MethodInput
+from advtex_engine.optimize import AdversarialOptimizer
+from advtex_engine.views import ViewMaps, related_pairs
+
+HISTORY_POINTS = 200  # loss means kept for the report and shown as progress
+
+
+@dataclass
+class _Run:
+    """Where the run stands: pyramid level, global step, losses so far."""
+
+    level: int
+    step: int
+    losses: list[LossPoint]
+
+
+def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
+    """Optimizes the texture; goes on from the work folder's checkpoint when there is one.
+
+    Returns the dense texture [H,W,3] float32 in [0,1] and the loss history. Raises Stopped, after a checkpoint, when
+    the monitor asks for it. On a CPU the result does not depend on whether and where the run was interrupted.
+    """
+    preset = given.preset
+    device = given.maps[1].color.device
+    # Weights are drawn on the CPU, so that a run starts from the same discriminator on every device.
+    discriminator = PatchDiscriminator(torch.Generator().manual_seed(given.config.seed)).to(device)
+    discriminator = discriminator.to(memory_format=torch.channels_last)
+    generator = torch.Generator(device).manual_seed(given.config.seed)
+    saved = given.work.load(CHECKPOINT)
+    run = _Run(saved["level"], saved["step"], saved["losses"]) if saved else _Run(0, 0, [])
+    texture = _start(given)
+    timer = CheckpointTimer(given.config.checkpoint_seconds)
+    for number, level in enumerate(preset.levels):
+        if number < run.level:
+            continue
+        maps = given.maps[level.scale]
+        optimizer = AdversarialOptimizer(
+            maps,
+            related_pairs(maps, given.kind, preset.max_pair_angle, preset.min_pair_overlap),
+            _compact(maps, texture),
+            preset,
+            kind=given.kind,
+            steps=preset.steps,
+            generator=generator,
+            discriminator=discriminator,
+        )
+        optimizer.index = run.step
+        if saved and number == run.level:
+            optimizer.load_state_dict(saved["optimizer"])
+        _run_level(given, optimizer, run, sum(part.steps for part in preset.levels[: number + 1]), timer)
+        texture = dense_texture(maps, (optimizer.values.detach() + 1) / 2)
+        run.level = number + 1
+    return texture.clamp(0, 1), run.losses
+
+
+def _run_level(given: MethodInput, optimizer: AdversarialOptimizer, run: _Run, end: int, timer: CheckpointTimer) -> None:
+    total = given.preset.steps
+    every = max(1, total // HISTORY_POINTS)
+    while run.step < end:
+        optimizer.step()
+        run.step += 1
+        if run.step % every == 0 or run.step == end:
+            losses = optimizer.drain_losses()
+            run.losses.append({"step": run.step, **losses})
+            given.monitor.progress(run.step, total, losses)
+        stop = given.monitor.stop_requested()
+        if stop or timer.due():
+            started = time.monotonic()
+            given.work.save(
+                CHECKPOINT,
+                {"level": run.level, "step": run.step, "losses": run.losses, "optimizer": optimizer.state_dict()},
+            )
+            timer.wrote(started)
+        if stop:
+            raise Stopped(f"stopped after step {run.step} of {total}; resume goes on from there")
+
+
+def _start(given: MethodInput) -> Tensor:
+    """The first level's dense start in [0,1]; the paper's zero start is mid-gray in the optimizer's [-1,1]."""
+    first = given.averages[given.preset.levels[0].scale]
+    return torch.full_like(first, 0.5) if given.preset.start == "zero" else first
+
+
+def _compact(maps: ViewMaps, texture: Tensor) -> Tensor:
+    """Rows [slots,3] in [-1,1] of a dense texture [H,W,3] in [0,1], resampled to the maps' texture size."""
+    height, width = maps.slot_map.shape
+    image = texture.permute(2, 0, 1)[None]
+    if texture.shape[:2] != (height, width):
+        image = F.interpolate(image, (height, width), mode="bilinear", align_corners=False)
+    return image[0].permute(1, 2, 0)[maps.slot_map >= 0] * 2 - 1

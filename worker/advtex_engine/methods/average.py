@@ -1,0 +1,41 @@
+"""The projected mean: every texel is the mean of the pixels that show it. Blurred wherever views disagree."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from advtex_engine.methods.inputs import LossPoint, MethodInput
+from advtex_engine.texture import bilinear_footprint, decode_uv, fill_holes
+from advtex_engine.views import ViewMaps
+
+
+def average(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
+    """The averaged texture at full size, [H,W,3] float32 in [0,1]; no iterations, so no losses."""
+    return given.averages[1], []
+
+
+def average_texture(maps: ViewMaps) -> Tensor:
+    """Splats all foreground pixels with their bilinear weights, normalizes, fills the rest -> [H,W,3] in [0,1]."""
+    height, width = maps.slot_map.shape
+    device = maps.color.device
+    size = torch.tensor([width, height], dtype=torch.float32, device=device)
+    total = torch.zeros((maps.slots, 3), device=device)
+    weight = torch.zeros(maps.slots, device=device)
+    flat_slots = maps.slot_map.flatten()
+    for view in range(maps.count):
+        seen = maps.depth[view] > 0
+        texels, weights = bilinear_footprint(decode_uv(maps.uv[view][seen]) * size, width, height)
+        slots = flat_slots[texels].clamp(min=0)
+        color = maps.color[view][seen].to(torch.float32) / 255
+        total.index_add_(0, slots.flatten(), (color[:, None, :] * weights[:, :, None]).flatten(0, 1))
+        weight.index_add_(0, slots.flatten(), weights.flatten())
+    return dense_texture(maps, total / weight.clamp(min=1e-6)[:, None])
+
+
+def dense_texture(maps: ViewMaps, values: Tensor) -> Tensor:
+    """Compact values [slots,3] as a dense texture [H,W,3], the texels that no view touches filled from their neighbors."""
+    known = maps.slot_map >= 0
+    texture = torch.zeros((*maps.slot_map.shape, 3), dtype=values.dtype, device=values.device)
+    texture[known] = values
+    return fill_holes(texture, known)

@@ -1,0 +1,32 @@
+"""What every texturing method is given."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from advtex_engine.checkpoint import WorkFolder
+from advtex_engine.config import Preset, TextureConfig
+from advtex_engine.monitor import Monitor
+from advtex_engine.views import ViewMaps
+
+LossPoint = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class MethodInput:
+    """View maps and averaged textures per pyramid scale (1 = full working size), and how to run.
+
+    averages: dense textures [H,W,3] float32 in [0,1], defined on every texel.
+    """
+
+    maps: Mapping[int, ViewMaps]
+    averages: Mapping[int, Tensor]
+    kind: str
+    preset: Preset
+    config: TextureConfig
+    monitor: Monitor
+    work: WorkFolder

@@ -1,0 +1,212 @@
+"""The optimization: a texture against a discriminator (paper section 3, supplement "Training").
+
+One step: draw a source view A and an auxiliary view B; warp B into A (real); render the texture at A (fake); let the
+discriminator judge [I_A, real - I_A] and [I_A, fake - I_A]; update both players from the same forward passes.
+
+Colors are in [-1, 1]. Pixels that B does not see carry a zero residual in the real and in the fake example alike, so that
+the discriminator cannot tell them apart by their holes. All draws come from one generator on the device, and nothing in
+`step` waits for the device: the crop's size is fixed and only its offset is drawn, a skipped discriminator update is a
+flag that Adam's kernel reads. On a CPU, where a branch costs nothing, the skipped gradient is not computed at all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advtex_engine.config import Preset
+from advtex_engine.discriminator import MIN_SIZE, PatchDiscriminator
+from advtex_engine.losses import adversarial_loss, discriminator_loss, l1_loss, patch_masks
+from advtex_engine.reproject import reproject, unproject_pixels
+from advtex_engine.texture import bilinear_footprint, decode_uv, sample_texels
+from advtex_engine.views import DEPTH_TOLERANCE, Pairs, ViewMaps
+
+CROP_SHARE = 0.1  # the released code shifts its crop by up to 69 of 640 pixels, about a tenth of the width
+LOSS_NAMES = ("discriminator", "adversarial", "l1", "skipped")
+
+
+@dataclass(frozen=True)
+class Batch:
+    """One pair, cropped to h x w: images [1,3,h,w] in [-1,1], masks [1,1,h,w] float 0/1, footprints [h*w,4]."""
+
+    condition: Tensor
+    real: Tensor
+    foreground: Tensor
+    visible: Tensor
+    slots: Tensor
+    weights: Tensor
+
+
+def native_bfloat16(device: torch.device) -> bool:
+    """Whether bf16 arithmetic is done by the processor and not emulated (emulation is four times slower than fp32)."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    probe = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
+    return device.type == "cpu" and probe is not None and bool(probe())
+
+
+def crop_size(width: int, height: int) -> tuple[int, int]:
+    """Fixed size of the randomly placed crop; the margin is a multiple of the patch stride."""
+    margin = 8 * max(1, round(CROP_SHARE * width / 8))
+    return max(MIN_SIZE, width - margin), max(MIN_SIZE, height - margin)
+
+
+class AdversarialOptimizer:
+    """State and step of one optimization over fixed view maps.
+
+    values: start of the compact texture, [slots,3] float32 in [-1,1]. steps: the whole run's length, which the decay of
+    lambda is scaled to; `index` counts the steps over all levels of a pyramid.
+    """
+
+    def __init__(
+        self,
+        maps: ViewMaps,
+        pairs: Pairs,
+        values: Tensor,
+        preset: Preset,
+        *,
+        kind: str,
+        steps: int,
+        generator: torch.Generator,
+        discriminator: PatchDiscriminator,
+    ) -> None:
+        assert values.shape == (maps.slots, 3)
+        device = maps.color.device
+        self.maps, self.pairs, self.preset, self.device = maps, pairs, preset, device
+        self.steps, self.index = steps, 0
+        self.tolerance = DEPTH_TOLERANCE[kind]
+        self.generator = generator
+        self.values = values.clone().to(device).requires_grad_(True)
+        self.discriminator = discriminator
+        self.parameters = list(discriminator.parameters())
+        self.adam_texture = _adam([self.values], preset.lr_texture, preset.beta1)
+        self.adam_discriminator = _adam(self.parameters, preset.lr_discriminator, preset.beta1)
+        self.bfloat16 = native_bfloat16(device)
+        self.crop = crop_size(maps.width, maps.height)
+        rows = torch.arange(self.crop[1], device=device)[:, None] * maps.width
+        self._window = (rows + torch.arange(self.crop[0], device=device)).flatten()
+        self._texture_size = torch.tensor(maps.slot_map.shape[::-1], dtype=torch.float32, device=device)
+        self._slot_map = maps.slot_map.flatten()
+        self._sums = torch.zeros(len(LOSS_NAMES), device=device)
+        self._summed = 0
+
+    @property
+    def l1_weight(self) -> float:
+        """lambda: l1_weight times l1_decay for each passed period; the paper's 1,000 of 50,000 steps are one period."""
+        periods = int(self.index * self.preset.l1_decays / self.steps)
+        return self.preset.l1_weight * self.preset.l1_decay**periods
+
+    def draw(self) -> Batch:
+        """A random pair and crop, with the auxiliary view warped into the source."""
+        maps, device = self.maps, self.device
+        random = torch.rand(4, generator=self.generator, device=device)
+        source = self.pairs.sources[_pick(random[0], self.pairs.sources.shape[0])]
+        candidate = _pick(random[1], self.pairs.count[source])
+        auxiliary = self.pairs.auxiliary[source, candidate]
+        width, height = self.crop
+        left = _pick(random[2], maps.width - width + 1)
+        top = _pick(random[3], maps.height - height + 1)
+        pixels = self._window + (top * maps.width + left)
+        flat = pixels + source * (maps.width * maps.height)
+        depth = maps.depth.view(-1)[flat].to(torch.float32)
+        foreground = depth > 0
+        points = unproject_pixels(pixels, depth, maps.intrinsics[source], maps.width)
+        real, visible = reproject(points, self.pairs.relative[source, candidate], maps, auxiliary, self.tolerance)
+        visible = visible & foreground
+        uv = decode_uv(maps.uv.view(-1, 2)[flat])
+        texels, weights = bilinear_footprint(uv * self._texture_size, maps.slot_map.shape[1], maps.slot_map.shape[0])
+        # A background pixel has uv 0; its weight is 0, so any row may stand for the texel that nobody owns.
+        slots = self._slot_map[texels].clamp(min=0)
+        return Batch(
+            condition=self._image(maps.color.view(-1, 3)[flat].to(torch.float32) / 127.5 - 1),
+            real=self._image(real / 127.5 - 1),
+            foreground=self._image(foreground.to(torch.float32)[:, None]),
+            visible=self._image(visible.to(torch.float32)[:, None]),
+            slots=slots,
+            weights=weights * visible[:, None],
+        )
+
+    def step(self) -> None:
+        """Draws a pair and updates the texture, and the discriminator unless it is ahead (its loss <= the texture's)."""
+        batch = self.draw()
+        masks = patch_masks(batch.foreground, batch.visible)
+        fake = self._image(sample_texels(self.values, batch.slots, batch.weights))
+        with self._autocast():
+            fake_logits = self.discriminator(batch.condition, (fake - batch.condition) * batch.visible).float()
+            real_logits = self.discriminator(batch.condition, (batch.real - batch.condition) * batch.visible).float()
+        loss_discriminator = discriminator_loss(real_logits, fake_logits, masks.discriminator)
+        adversarial = adversarial_loss(fake_logits, masks.texture)
+        l1 = l1_loss(fake, batch.real, batch.visible)
+        (gradient,) = torch.autograd.grad(adversarial + self.l1_weight * l1, [self.values], retain_graph=True)
+        ahead = (loss_discriminator <= adversarial).to(torch.float32).detach()
+        self._update_discriminator(loss_discriminator, ahead)
+        self.values.grad = gradient
+        self.adam_texture.step()
+        self._sums += torch.stack((loss_discriminator.detach(), adversarial.detach(), l1.detach(), ahead))
+        self._summed += 1
+        self.index += 1
+
+    def _update_discriminator(self, loss: Tensor, ahead: Tensor) -> None:
+        if self.device.type == "cpu" and bool(ahead):
+            return
+        for parameter, gradient in zip(self.parameters, torch.autograd.grad(loss, self.parameters), strict=True):
+            # The fused CPU kernel reads a channels_last gradient as if it were contiguous.
+            parameter.grad = gradient.contiguous()
+        if self.device.type != "cpu":
+            self.adam_discriminator.found_inf = ahead  # type: ignore[attr-defined]  # the fused kernel's skip flag
+        self.adam_discriminator.step()
+
+    def drain_losses(self) -> dict[str, float]:
+        """Means since the last call (waits for the device); empty when no step was taken."""
+        if self._summed == 0:
+            return {}
+        means = (self._sums / self._summed).tolist()
+        self._sums.zero_()
+        self._summed = 0
+        return dict(zip(LOSS_NAMES, means, strict=True))
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that decides the remaining steps; tensors on the CPU."""
+        state: dict[str, Any] = {
+            "index": self.index,
+            "values": self.values.detach(),
+            "discriminator": self.discriminator.state_dict(),
+            "adam_texture": self.adam_texture.state_dict(),
+            "adam_discriminator": self.adam_discriminator.state_dict(),
+            "generator": self.generator.get_state(),
+        }
+        return state
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues from `state_dict` of an optimizer over the same view maps."""
+        assert state["values"].shape == self.values.shape
+        self.index = int(state["index"])
+        with torch.no_grad():
+            self.values.copy_(state["values"])
+        self.discriminator.load_state_dict(state["discriminator"])
+        self.adam_texture.load_state_dict(state["adam_texture"])
+        self.adam_discriminator.load_state_dict(state["adam_discriminator"])
+        self.generator.set_state(state["generator"])
+
+    def _image(self, rows: Tensor) -> Tensor:
+        """Rows [h*w,C] as an image [1,C,h,w] (channels_last memory, no copy)."""
+        return rows.view(1, self.crop[1], self.crop[0], rows.shape[1]).permute(0, 3, 1, 2)
+
+    def _autocast(self) -> contextlib.AbstractContextManager[Any]:
+        if not self.bfloat16:
+            return contextlib.nullcontext()
+        return torch.autocast(self.device.type, dtype=torch.bfloat16)
+
+
+def _adam(parameters: list[Any], lr: float, beta1: float) -> torch.optim.Adam:
+    on_gpu = parameters[0].device.type == "cuda"
+    return torch.optim.Adam(parameters, lr=lr, betas=(beta1, 0.999), fused=True, capturable=on_gpu)
+
+
+def _pick(random: Tensor, count: int | Tensor) -> Tensor:
+    """Uniform integer in [0, count) from a uniform number in [0, 1); float32 rounding must not reach count."""
+    return (random * count).long().clamp(max=count - 1)

@@ -1,0 +1,169 @@
+"""What a run says about itself: stage times, held-out scores, previews, report.json; and the scene's cache form."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import platform
+import resource
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advtex_engine.checkpoint import WorkFolder
+from advtex_engine.files import write_atomically
+from advtex_engine.metrics import score_views
+from advtex_engine.monitor import Monitor
+from advtex_engine.previews import contact_sheet, evenly_spread, render_layers, render_view, side_by_side
+from advtex_engine.rasterize import rasterize
+from advtex_engine.scene import Atlas, Camera, Mesh, Scene, View
+from advtex_engine.views import DEPTH_TOLERANCE
+
+SHEET_VIEWS = 6
+
+
+def peak_memory_bytes() -> int:
+    """The process's largest resident set so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+class Stages:
+    """Times the stages and tells the monitor; `records` go into the report. A resumed run keeps the first run's."""
+
+    def __init__(self, monitor: Monitor, folder: WorkFolder) -> None:
+        self.monitor, self.folder = monitor, folder
+        self.records: list[dict[str, Any]] = []
+        saved = folder.load("stages")
+        self._saved = {record["stage"]: record for record in saved["records"]} if saved else {}
+
+    @contextmanager
+    def run(self, stage: str) -> Iterator[None]:
+        self.monitor.stage_started(stage)
+        started = time.monotonic()
+        yield
+        seconds = time.monotonic() - started
+        self.records.append(
+            {"stage": stage, "seconds": round(seconds, 3), "peak_memory_bytes": peak_memory_bytes(), "resumed": False}
+        )
+        self.monitor.stage_finished(stage, seconds, peak_memory_bytes())
+
+    def restore(self, *stages: str) -> None:
+        """Takes over the records of stages whose result was found in the work folder."""
+        self.records += [{**self._saved[stage], "resumed": True} for stage in stages if stage in self._saved]
+
+    def save(self) -> None:
+        self.folder.save("stages", {"records": self.records})
+
+
+def versions() -> dict[str, str]:
+    """Versions of what decides the result."""
+    names = ("advtex", "torch", "numpy", "opencv-python-headless", "trimesh", "xatlas", "fast-simplification")
+    found = {"python": platform.python_version()}
+    for name in names:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def describe_scene(scene: Scene) -> dict[str, Any]:
+    """Counts and names of what was used."""
+    camera = scene.views[0].camera
+    return {
+        "views": len(scene.views),
+        "heldout": [view.name for view in scene.heldout],
+        "width": camera.width,
+        "height": camera.height,
+        "depth": scene.views[0].depth is not None,
+        "faces": scene.mesh.t_pos_idx.shape[0],
+        "vertices": scene.mesh.v_pos.shape[0],
+        "kind": scene.kind,
+        "up_axis": scene.up_axis,
+        "notes": list(scene.notes),
+    }
+
+
+def heldout_scores(scene: Scene, atlas: Atlas, texture: Tensor, average: Tensor) -> dict[str, Any] | None:
+    """Scores of the held-out views for the texture and for plain averaging; None when no view was held out.
+
+    A pixel counts where the mesh is hit and the device's depth, where there is one, agrees with it.
+    """
+    if not scene.heldout:
+        return None
+    photos, masks = [], []
+    for view in scene.heldout:
+        fragments = rasterize(atlas.mesh, view.camera)
+        mask = fragments.face_index >= 0
+        if view.depth is not None:
+            agrees = (view.depth - fragments.depth).abs() < DEPTH_TOLERANCE[scene.kind]
+            mask = mask & ((view.depth == 0) | agrees)
+        photos.append(view.color.to(torch.float32) / 255)
+        masks.append(mask)
+    scores = {}
+    for name, candidate in (("texture", texture), ("average", average)):
+        renders = [render_layers(atlas, candidate, view.camera)[0] for view in scene.heldout]
+        scores[name] = score_views(renders, photos, masks)
+    return scores
+
+
+def write_previews(out: Path, scene: Scene, atlas: Atlas, texture: Tensor, average: Tensor) -> tuple[Path, ...]:
+    """previews/comparison.png (one view) and previews/sheet.png: photograph | texture | plain average.
+
+    Held-out views where there are some, else training views from all over the capture.
+    """
+    folder = out / "previews"
+    folder.mkdir(exist_ok=True)
+    views = evenly_spread(scene.heldout or scene.views, SHEET_VIEWS)
+    rows = [[render_view(atlas, candidate, view.camera) for candidate in (texture, average)] for view in views]
+    comparison, sheet = folder / "comparison.png", folder / "sheet.png"
+    middle = len(views) // 2
+    side_by_side(views[middle], *rows[middle], comparison)
+    contact_sheet(views, rows, ("advtex", "plain average"), sheet)
+    return comparison, sheet
+
+
+def write_report(out: Path, report: Mapping[str, Any]) -> Path:
+    path = out / "report.json"
+    write_atomically(path, json.dumps(report, indent=1, default=str).encode() + b"\n")
+    return path
+
+
+def scene_to_dict(scene: Scene) -> dict[str, Any]:
+    """The scene as tensors and plain values; `scene_from_dict` is its inverse."""
+    return {
+        "mesh": {key: value for key, value in vars(scene.mesh).items() if value is not None},
+        "views": [_view_to_dict(view) for view in scene.views],
+        "heldout": [_view_to_dict(view) for view in scene.heldout],
+        "kind": scene.kind,
+        "up_axis": scene.up_axis,
+        "notes": list(scene.notes),
+    }
+
+
+def scene_from_dict(saved: Mapping[str, Any]) -> Scene:
+    """Inverse of `scene_to_dict`."""
+    return Scene(
+        Mesh(**saved["mesh"]),
+        tuple(_view_from_dict(view) for view in saved["views"]),
+        tuple(_view_from_dict(view) for view in saved["heldout"]),
+        saved["kind"],
+        saved["up_axis"],
+        tuple(saved["notes"]),
+    )
+
+
+def _view_to_dict(view: View) -> dict[str, Any]:
+    return {"name": view.name, "camera": asdict(view.camera), "color": view.color, "depth": view.depth}
+
+
+def _view_from_dict(saved: Mapping[str, Any]) -> View:
+    return View(saved["name"], Camera(**saved["camera"]), saved["color"], saved["depth"])

@@ -1,0 +1,135 @@
+"""Sampling a texture stored as the compact list of its texels, and filling the texels that no view touched.
+
+Convention: uv has its origin at the texture's first row and column; texel (row i, column j) has its centre at
+((j + 0.5) / width, (i + 0.5) / height). Between centres the texture is bilinear; outside the outermost centres it
+is clamped.
+
+The optimizer owns only the texels that some view samples, as a matrix [N,C] (`slot` = row). A 2048² atlas is about half
+empty, so this halves the bytes of the gradient and of Adam's state; a slot map [H,W] int32 (-1 = not owned) leads from
+the dense texture to the rows.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+UV_LEVELS = 65535
+
+
+def encode_uv(uv: Tensor) -> Tensor:
+    """uv [...,2] float in [0,1] -> int16, 1/65535 of the texture per level (1/32 texel at 2048)."""
+    return ((uv.clamp(0, 1) * UV_LEVELS).round() - 32768).to(torch.int16)
+
+
+def decode_uv(code: Tensor) -> Tensor:
+    """Inverse of `encode_uv`: int16 [...,2] -> float32 uv."""
+    return (code.to(torch.float32) + 32768) / UV_LEVELS
+
+
+def bilinear_footprint(xy: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """The four grid cells around continuous pixel positions, and their weights.
+
+    xy: [P,2] positions in pixels, first centre at (0.5, 0.5); clamped to the outermost centres.
+    Returns indices [P,4] int64 into the flattened height x width grid and weights [P,4]; order: (y0,x0), (y0,x1),
+    (y1,x0), (y1,x1). Not differentiable with respect to xy.
+    """
+    assert xy.ndim == 2 and xy.shape[1] == 2
+    x = (xy[:, 0] - 0.5).clamp(0, width - 1)
+    y = (xy[:, 1] - 0.5).clamp(0, height - 1)
+    x0 = x.floor().clamp(max=max(width - 2, 0))
+    y0 = y.floor().clamp(max=max(height - 2, 0))
+    fx, fy = x - x0, y - y0
+    corner = y0.long() * width + x0.long()
+    right = 1 if width > 1 else 0
+    down = width if height > 1 else 0
+    indices = torch.stack((corner, corner + right, corner + down, corner + down + right), dim=1)
+    weights = torch.stack(((1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy), dim=1)
+    return indices, weights
+
+
+class _SampleTexels(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, slots: Tensor, weights: Tensor) -> Tensor:
+        ctx.save_for_backward(slots, weights)
+        ctx.rows = values.shape[0]
+        return F.embedding_bag(slots, values, per_sample_weights=weights, mode="sum")
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> tuple[Tensor, None, None]:
+        slots, weights = ctx.saved_tensors
+        (grad,) = grads
+        # embedding_bag's own backward sorts the indices (ten times slower on a CPU) and adds a gradient for the weights.
+        spread = (grad[:, None, :] * weights[:, :, None]).flatten(0, 1)
+        dense = torch.zeros((ctx.rows, grad.shape[1]), dtype=grad.dtype, device=grad.device)
+        return dense.index_add_(0, slots.flatten(), spread), None, None
+
+
+def sample_texels(values: Tensor, slots: Tensor, weights: Tensor) -> Tensor:
+    """Weighted sum of four texels per pixel: values [N,C], slots [P,4] integer, weights [P,4] -> [P,C].
+
+    Differentiable with respect to `values` only. Same as grid_sample (bilinear, border, align_corners=False) on the
+    dense texture, without touching the texels that no pixel needs.
+    """
+    assert values.ndim == 2 and slots.shape == weights.shape and slots.shape[1] == 4
+    out: Tensor = _SampleTexels.apply(values, slots, weights)  # type: ignore[no-untyped-call]
+    return out
+
+
+def sample_image(image: Tensor, xy: Tensor) -> Tensor:
+    """Bilinear samples of a dense image [H,W,C] at pixel positions xy [P,2] -> [P,C] float32. No gradient."""
+    height, width, channels = image.shape
+    indices, weights = bilinear_footprint(xy, width, height)
+    flat = image.reshape(height * width, channels).to(torch.float32)
+    return F.embedding_bag(indices, flat, per_sample_weights=weights, mode="sum")
+
+
+def touched_slots(uv_codes: Tensor, foreground: Tensor, width: int, height: int) -> tuple[Tensor, int]:
+    """Which texels the views sample.
+
+    uv_codes: [V,H,W,2] int16; foreground: [V,H,W] bool. Returns the slot map [height,width] int32 (-1 = untouched) and
+    the number of slots; slots are numbered in row-major texel order.
+    """
+    touched = torch.zeros(height * width, dtype=torch.bool, device=uv_codes.device)
+    size = torch.tensor([width, height], dtype=torch.float32, device=uv_codes.device)
+    for codes, mask in zip(uv_codes, foreground, strict=True):
+        indices, weights = bilinear_footprint(decode_uv(codes[mask]) * size, width, height)
+        touched[indices[weights > 0]] = True
+    order = touched.to(torch.int32).cumsum(0, dtype=torch.int32)
+    slot_map = torch.where(touched, order - 1, -1).view(height, width)
+    return slot_map, int(order[-1])
+
+
+def fill_holes(texture: Tensor, known: Tensor) -> Tensor:
+    """Colors every unknown texel from the nearest known ones, so that filtering across chart borders never bleeds.
+
+    texture: [H,W,C] float; known: [H,W] bool. Push-pull (Gortler et al. 1996, section 6): average known texels into
+    ever coarser levels, then fill from the coarse levels back to the fine ones. Known texels keep their value; a
+    texture without a known texel stays as it is.
+    """
+    assert texture.ndim == 3 and known.shape == texture.shape[:2]
+    if not bool(known.any()):
+        return texture
+    image = texture.permute(2, 0, 1)[None].to(torch.float32)
+    weight = known[None, None].to(torch.float32)
+    filled = _push_pull(image * weight, weight)
+    return torch.where(known[:, :, None], texture, filled[0].permute(1, 2, 0).to(texture.dtype))
+
+
+def _push_pull(weighted: Tensor, weight: Tensor) -> Tensor:
+    """weighted [1,C,H,W] (color times weight), weight [1,1,H,W] in [0,1] -> dense color [1,C,H,W]."""
+    height, width = weight.shape[-2:]
+    color = weighted / weight.clamp(min=1e-12)
+    if height == 1 and width == 1:
+        return color
+    pooled = F.avg_pool2d(torch.cat((weighted, weight), 1), 2, ceil_mode=True, count_include_pad=False)
+    # A coarse texel with any known child counts as fully known: its average is the best guess for the others.
+    coarse_weight = pooled[:, -1:]
+    coarse_known = (coarse_weight > 0).to(weight.dtype)
+    coarse_color = pooled[:, :-1] / coarse_weight.clamp(min=1e-12) * coarse_known
+    coarse = _push_pull(coarse_color, coarse_known)
+    up = F.interpolate(coarse, scale_factor=2.0, mode="bilinear", align_corners=False)[..., :height, :width]
+    return torch.where(weight > 0, color, up)

@@ -1,0 +1,150 @@
+"""All views on the device as compact types, and the pairs that the loader draws from (paper section 3.3).
+
+Per view and pixel: color 3 bytes, uv 4 bytes (two int16), depth 2 bytes (float16 metres): 9 bytes, 2.8 MB at 640x480.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from advtex_engine.rasterize import rasterize_views
+from advtex_engine.reproject import auxiliary_visibility, unproject_pixels
+from advtex_engine.scene import Atlas, View
+from advtex_engine.texture import encode_uv, touched_slots
+
+DEPTH_TOLERANCE = {"object": 0.03, "scene": 0.1}  # theta_z, metres (paper section 3.3)
+OVERLAP_STRIDE = 4  # pixels; overlaps are estimated on a coarser grid
+
+
+@dataclass(frozen=True)
+class ViewMaps:
+    """What the optimization reads, V views of H x W pixels.
+
+    color: [V,H*W,3] uint8. uv: [V,H*W,2] int16 (texture.encode_uv). depth: [V,H*W] float16 metres along z, rendered
+    from the mesh; 0 = background (no mesh, or the device's depth contradicts the mesh).
+    intrinsics: [V,4] float32 fx, fy, cx, cy in pixels. world_to_camera: [V,4,4] float64.
+    slot_map: [texture height, texture width] int32, rows of the compact texture, -1 = sampled by no view.
+    """
+
+    color: Tensor
+    uv: Tensor
+    depth: Tensor
+    intrinsics: Tensor
+    world_to_camera: Tensor
+    slot_map: Tensor
+    slots: int
+    width: int
+    height: int
+
+    @property
+    def count(self) -> int:
+        return self.color.shape[0]
+
+    def to(self, device: torch.device) -> ViewMaps:
+        """The same maps on another device."""
+        moved = (self.color, self.uv, self.depth, self.intrinsics, self.world_to_camera, self.slot_map)
+        return ViewMaps(*(tensor.to(device) for tensor in moved), self.slots, self.width, self.height)
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Source views and their auxiliary views, padded to K candidates per source.
+
+    auxiliary: [V,K] int64 view indices, the view itself first. count: [V] int64, how many are real; a source without
+    any foreground has 0 and is never drawn. sources: [S] int64, the views that can be drawn.
+    relative: [V,K,3,4] float32, source camera to auxiliary camera.
+    """
+
+    auxiliary: Tensor
+    count: Tensor
+    sources: Tensor
+    relative: Tensor
+
+
+def build_view_maps(atlas: Atlas, views: tuple[View, ...], kind: str) -> ViewMaps:
+    """Rasterizes every view: view-to-texture map, depth and foreground.
+
+    Device depth masks what the mesh lacks: a pixel whose measured depth differs from the mesh's by more than theta_z
+    shows something else than the mesh.
+    """
+    assert views and all((v.camera.width, v.camera.height) == (views[0].camera.width, views[0].camera.height) for v in views)
+    mesh, device = atlas.mesh, atlas.mesh.v_pos.device
+    assert mesh.v_uv is not None and mesh.t_uv_idx is not None
+    width, height, tolerance = views[0].camera.width, views[0].camera.height, DEPTH_TOLERANCE[kind]
+    uv, depth = [], []
+    for view, fragments in zip(views, rasterize_views(mesh, [view.camera for view in views]), strict=True):
+        hit = fragments.face_index >= 0
+        if view.depth is not None:
+            measured = view.depth.to(device)
+            hit = hit & ((measured == 0) | ((measured - fragments.depth).abs() < tolerance))
+        corners = mesh.v_uv[mesh.t_uv_idx[fragments.face_index.clamp(min=0).long()]]
+        uv.append(encode_uv((corners * fragments.barycentric[..., None]).sum(2)))
+        depth.append(torch.where(hit, fragments.depth, 0.0).to(torch.float16))
+    uv_codes, depths = torch.stack(uv), torch.stack(depth)
+    slot_map, slots = touched_slots(uv_codes, depths > 0, atlas.width, atlas.height)
+    K = torch.stack([view.camera.K for view in views])
+    return ViewMaps(
+        color=torch.stack([view.color for view in views]).to(device).reshape(len(views), -1, 3),
+        uv=uv_codes.reshape(len(views), -1, 2),
+        depth=depths.reshape(len(views), -1),
+        intrinsics=torch.stack((K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2]), 1).to(device, torch.float32),
+        world_to_camera=torch.stack([view.camera.world_to_camera for view in views]).to(device, torch.float64),
+        slot_map=slot_map,
+        slots=slots,
+        width=width,
+        height=height,
+    )
+
+
+def overlaps(maps: ViewMaps, kind: str, max_angle: float) -> Tensor:
+    """Share [V,V] of each source's foreground that the auxiliary view sees too; 0 beyond max_angle (degrees).
+
+    The angle is that between the optical axes. Estimated on every OVERLAP_STRIDE-th pixel.
+    """
+    device, count = maps.depth.device, maps.count
+    axes = maps.world_to_camera[:, 2, :3]
+    near = (axes @ axes.T).clamp(-1, 1) >= math.cos(math.radians(max_angle))
+    ys = torch.arange(OVERLAP_STRIDE // 2, maps.height, OVERLAP_STRIDE, device=device)
+    xs = torch.arange(OVERLAP_STRIDE // 2, maps.width, OVERLAP_STRIDE, device=device)
+    pixels = (ys[:, None] * maps.width + xs[None, :]).flatten()
+    share = torch.zeros((count, count), device=device)
+    camera_to_world = torch.linalg.inv(maps.world_to_camera)
+    for source in range(count):
+        depth = maps.depth[source, pixels].to(torch.float32)
+        seen = depth > 0
+        if not bool(seen.any()):
+            continue
+        points = unproject_pixels(pixels[seen], depth[seen], maps.intrinsics[source], maps.width)
+        for auxiliary in near[source].nonzero().flatten().tolist():
+            relative = (maps.world_to_camera[auxiliary] @ camera_to_world[source])[:3].to(torch.float32)
+            visible = auxiliary_visibility(points, relative, maps, torch.tensor(auxiliary, device=device), DEPTH_TOLERANCE[kind])
+            share[source, auxiliary] = visible.to(torch.float32).mean()
+    return share
+
+
+def related_pairs(maps: ViewMaps, kind: str, max_angle: float, min_overlap: float) -> Pairs:
+    """Auxiliary candidates per source: optical axes within max_angle (degrees) and overlap above min_overlap.
+
+    The view itself is a candidate once (released code). A view without any other candidate gets the view that overlaps
+    it most, whatever the angle, so that sparse scans still learn from misaligned pairs.
+    """
+    count, device = maps.count, maps.depth.device
+    share = overlaps(maps, kind, max_angle)
+    related = (share > min_overlap).fill_diagonal_(False)
+    lonely = (~related.any(1)).nonzero().flatten().tolist()
+    if lonely:
+        wide = overlaps(maps, kind, 60.0).fill_diagonal_(0.0)
+        for source in lonely:
+            best = int(wide[source].argmax())
+            related[source, best] = bool(wide[source, best] > min_overlap)
+    candidates = [[source, *related[source].nonzero().flatten().tolist()] for source in range(count)]
+    width = max(len(row) for row in candidates)
+    auxiliary = torch.tensor([row + [row[0]] * (width - len(row)) for row in candidates], device=device)
+    has_foreground = (maps.depth > 0).any(1)
+    number = torch.tensor([len(row) for row in candidates], device=device) * has_foreground
+    relative = maps.world_to_camera[auxiliary] @ torch.linalg.inv(maps.world_to_camera)[:, None]
+    return Pairs(auxiliary, number, has_foreground.nonzero().flatten(), relative[:, :, :3].to(torch.float32).contiguous())

@@ -1,7 +1,7 @@
 """A scan's files, from a folder or a zip, read as streams; nothing is ever unpacked to disk.
 
     with open_scan("scan.zip") as archive:
-        archive.names()                       # "color/0.jpg", ...: sorted, relative to the one top folder if there is one
+        archive.names()                       # "color/0.jpg", ...: sorted, below the one top folder if there is one
         archive.read("color/0.jpg", 1 << 20)  # bytes, at most so many
         archive.read_range("scan.sens", 4096, 100)
 

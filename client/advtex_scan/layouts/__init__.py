@@ -7,10 +7,10 @@ write the module and put it into LAYOUTS.
 from __future__ import annotations
 
 from advtex_scan.archive import ScanArchive
-from advtex_scan.layouts import mvs_cam, native, seven_scenes
+from advtex_scan.layouts import mvs_cam, native, scannet, sens, seven_scenes
 from advtex_scan.layouts._reader import Layout, Match, ScanReader
 
-LAYOUTS: tuple[Layout, ...] = (native, seven_scenes, mvs_cam)
+LAYOUTS: tuple[Layout, ...] = (native, scannet, seven_scenes, mvs_cam, sens)
 
 __all__ = ["LAYOUTS", "Layout", "Match", "ScanReader", "detect_layout"]
 

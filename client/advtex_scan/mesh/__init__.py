@@ -7,8 +7,12 @@ from __future__ import annotations
 
 from advtex_scan.archive import ScanArchive
 from advtex_scan.errors import MeshError
+from advtex_scan.mesh._gltf import read_gltf
+from advtex_scan.mesh._obj import read_obj
 from advtex_scan.mesh._ply import read_ply
 from advtex_scan.mesh._surface import MeshFacts, MeshSurface, broken, finish
+
+READERS = {"ply": read_ply, "obj": read_obj, "glb": read_gltf, "gltf": read_gltf}
 
 __all__ = ["MeshFacts", "MeshSurface", "read_mesh"]
 
@@ -20,6 +24,6 @@ def read_mesh(archive: ScanArchive, path: str) -> MeshSurface:
     counts that disagree with the file's size, unsupported compression.
     """
     suffix = path.lower().rsplit(".", 1)[-1]
-    if suffix == "ply":
-        return finish(read_ply(archive, path), path)
+    if suffix in READERS:
+        return finish(READERS[suffix](archive, path), path)
     raise MeshError(broken(path, "is of no known kind", "convert it to PLY, OBJ or GLB"))

@@ -53,7 +53,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-ScanPath = Annotated[Path, typer.Argument(help="a scan: a folder or a zip")]
+ScanPath = Annotated[Path, typer.Argument(exists=True, readable=True, help="a scan: a folder or a zip")]
 JobId = Annotated[str, typer.Argument(help="the job's id, as `submit` prints it", metavar="JOB")]
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON on stdout")]
 Url = Annotated[str | None, typer.Option("--url", help="the server; else ADVTEX_URL or the configuration file")]

@@ -1,0 +1,26 @@
+"""The user's options as the engine's configuration."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from advtex_contract.options import JobOptions
+from advtex_engine.config import TextureConfig
+from advtex_engine.errors import OptionError
+
+
+def texture_config(options: JobOptions, device: str) -> TextureConfig:
+    """What the engine is asked to do. Raises OptionError."""
+    if (options.width is None) != (options.height is None):
+        raise OptionError("only one of width and height is set; give both, or none to keep the scan's own size")
+    size = (options.width, options.height) if options.width and options.height else None
+    config = TextureConfig(
+        preset=options.preset.value,
+        size=size,
+        holdout=options.holdout,
+        steps=options.steps,
+        max_texture_size=options.max_texture_size,
+        device=device,
+        seed=options.seed,
+    )
+    return config if options.face_budget is None else replace(config, face_budget=options.face_budget)

@@ -1,0 +1,269 @@
+"""One attempt of one job, from the claim to the commit. Nothing here imports torch."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import structlog
+
+from advtex_contract.errors import ErrorDetail
+from advtex_contract.jobs import JobError
+from advtex_store import keys
+from advtex_store.errors import BlobNotFound, StaleAttempt
+from advtex_store.records import Claim
+from advtex_store.store import Store
+from advtex_worker.checkpoints import CheckpointUploader, restore
+from advtex_worker.child import Child, death_sentence
+from advtex_worker.events import (
+    CheckpointEvent,
+    FailedEvent,
+    FinishedEvent,
+    ProgressEvent,
+    Request,
+    StageEvent,
+    StoppedEvent,
+    WarningEvent,
+)
+from advtex_worker.lease import Ending, LeaseKeeper
+from advtex_worker.progress import ProgressTracker
+from advtex_worker.settings import WorkerSettings
+
+RETRY_SECONDS = 5.0
+
+T = TypeVar("T")
+log = structlog.get_logger()
+
+
+class Interrupted(Exception):
+    """The run has to end (`LeaseKeeper.ending` says why) while something waits for storage."""
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """The folders of one attempt. `snapshots` lies beside `work`, so that hard links reach it."""
+
+    root: Path
+
+    @property
+    def scan(self) -> Path:
+        return self.root / "scan.zip"
+
+    @property
+    def work(self) -> Path:
+        return self.root / "work"
+
+    @property
+    def snapshots(self) -> Path:
+        return self.root / "snapshots"
+
+    @property
+    def out(self) -> Path:
+        return self.root / "out"
+
+    @property
+    def log(self) -> Path:
+        return self.root / "engine.log"
+
+    def make(self) -> None:
+        shutil.rmtree(self.root, ignore_errors=True)
+        for folder in (self.work, self.snapshots, self.out):
+            folder.mkdir(parents=True)
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep `sweep` away, until this process ends at the latest."""
+        handle = os.open(self.root, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield
+        finally:
+            os.close(handle)
+
+    def results(self) -> dict[str, Path]:
+        """Everything in the out folder, by its name there."""
+        files = (path for path in sorted(self.out.rglob("*")) if path.is_file())
+        return {path.relative_to(self.out).as_posix(): path for path in files}
+
+
+def sweep(workspaces: Path) -> None:
+    """Remove what killed attempts left behind."""
+    for root in workspaces.glob("*/"):
+        with suppress(OSError), Workspace(root).held():  # BlockingIOError: it is in use
+            shutil.rmtree(root, ignore_errors=True)
+
+
+class Attempt:
+    """Carries a claimed job to one of its ends. `stop` may be called at any time, also from a signal handler."""
+
+    def __init__(self, store: Store, settings: WorkerSettings, engine: str, claim: Claim) -> None:
+        self._store = store
+        self._settings = settings
+        self._engine = engine
+        self._job_id = claim.job_id
+        self._number = claim.attempt
+        self._claim = claim
+        self._space = Workspace(settings.workspaces / f"{claim.job_id}-{claim.attempt}")
+        self._keeper = LeaseKeeper(
+            store.records,
+            claim.job_id,
+            claim.attempt,
+            interval=settings.heartbeat_seconds,
+            on_ending=self._on_ending,
+            log_tail=self._log_tail,
+        )
+        self._child: Child | None = None
+        self._killer: threading.Timer | None = None
+        self._warnings: list[ErrorDetail] = []
+        self._log = log.bind(job=claim.job_id, attempt=claim.attempt)
+
+    def stop(self) -> None:
+        """The worker must go: checkpoint, and leave the job to the next attempt."""
+        threading.Thread(target=self._keeper.end, args=(Ending.preempt,), daemon=True).start()
+
+    def carry(self) -> None:
+        """Do the work and record how it ended. A lost lease ends it without a word: the job is another attempt's."""
+        self._keeper.start()
+        try:
+            if not self._persist(lambda: self._store.results.adopt(self._job_id)):
+                self._persist(self._space.make)
+                with self._space.held():
+                    self._run()
+        except Interrupted:
+            self._give_back()
+        except StaleAttempt as error:
+            self._log.warning("attempt is stale", reason=str(error))
+        finally:
+            self._keeper.stop()
+            shutil.rmtree(self._space.root, ignore_errors=True)
+
+    def _run(self) -> None:
+        try:
+            self._persist(lambda: self._store.blobs.fetch(self._claim.scan_key, self._space.scan))
+        except BlobNotFound:
+            message = "the scan is no longer stored; submit it again"
+            self._store.records.fail(self._job_id, self._number, JobError(code="scan_missing", message=message))
+            return
+        base = self._persist(lambda: restore(self._store.blobs, self._job_id, self._number, self._space.work))
+        self._log.info("attempt begins", resumed_files=len(base.files))
+        uploader = CheckpointUploader(self._store.blobs, self._job_id, self._number, base, self._keeper.beat)
+        ended: FinishedEvent | FailedEvent | StoppedEvent | None = None
+        try:
+            self._child = self._spawn(resume=bool(base.files))
+            ended = self._listen(self._child, uploader)
+            code = self._child.wait()
+        finally:
+            if self._child:
+                self._child.kill()
+            if self._killer:
+                self._killer.cancel()
+            if self._keeper.ending is Ending.lost:
+                uploader.abandon()
+            else:
+                uploader.finish()
+        self._conclude(ended, code)
+
+    def _spawn(self, resume: bool) -> Child:
+        space = self._space
+        request = Request(
+            engine=self._engine,
+            scan=space.scan,
+            out=space.out,
+            work=space.work,
+            snapshots=space.snapshots,
+            resume=resume,
+            options=self._claim.options,
+            device=self._settings.device,
+        )
+        child = Child(request, space.log, self._settings.threads)
+        self._log.info("runner started", pid=child.pid)
+        return child
+
+    def _listen(self, child: Child, uploader: CheckpointUploader) -> FinishedEvent | FailedEvent | StoppedEvent | None:
+        """Everything the runner says, in order. -> how it said that it ended, None if it died."""
+        if self._keeper.ending:  # asked before there was anybody to ask
+            self._on_ending(self._keeper.ending)
+        tracker = ProgressTracker()
+        for event in child.events():
+            match event:
+                case StageEvent():
+                    tracker.stage(event)
+                case ProgressEvent():
+                    tracker.progress(event)
+                case WarningEvent():
+                    self._warnings.append(event.problem)
+                case CheckpointEvent():
+                    uploader.add(event.files)
+                case _:
+                    return event
+            self._keeper.report(tracker.view, tracker.reached)
+        return None
+
+    def _conclude(self, ended: FinishedEvent | FailedEvent | StoppedEvent | None, code: int) -> None:
+        records, job_id, number = self._store.records, self._job_id, self._number
+        self._log.info("runner ended", ending=ended.kind if ended else death_sentence(code), asked=self._keeper.ending)
+        if self._keeper.ending is Ending.lost:
+            return
+        self._keeper.beat()  # the newest progress is recorded before the end
+        tail = self._log_tail()
+        if isinstance(ended, FinishedEvent):
+            self._persist(lambda: self._store.results.commit(job_id, number, self._space.results(), self._warnings))
+            with suppress(Exception):  # they are only worth their space now; deleting the job removes them too
+                self._store.blobs.delete_prefix(keys.checkpoints_prefix(job_id))
+        elif isinstance(ended, FailedEvent) and ended.code == "invalid_scan":
+            error = JobError(code=ended.code, message=ended.message, details=ended.details)
+            records.reject(job_id, number, error)
+        elif isinstance(ended, FailedEvent):
+            error = JobError(code=ended.code, message=ended.message, details=ended.details, log_tail=tail)
+            records.fail(job_id, number, error)
+        elif self._keeper.ending:
+            self._give_back()
+        else:
+            sentence = death_sentence(code)
+            state = records.lost(job_id, number, log_tail=f"{tail.rstrip()}\n{sentence}\n".lstrip())
+            self._log.warning("runner died", reason=sentence, job_is=state)
+
+    def _give_back(self) -> None:
+        """After a cancel or a SIGTERM, with whatever checkpoint there is."""
+        if self._keeper.ending is Ending.cancel:
+            self._store.records.canceled(self._job_id, self._number)
+        elif self._keeper.ending is Ending.preempt:
+            self._store.records.preempt(self._job_id, self._number)
+
+    def _on_ending(self, ending: Ending) -> None:
+        child = self._child
+        if child is None:
+            return
+        if ending is Ending.lost:
+            child.kill()
+            return
+        child.ask_to_stop()
+        if self._killer is None:
+            self._killer = threading.Timer(self._settings.grace_seconds, child.kill)
+            self._killer.daemon = True
+            self._killer.start()
+
+    def _log_tail(self) -> str:
+        return self._child.log_tail() if self._child else ""
+
+    def _persist(self, action: Callable[[], T]) -> T:
+        """Try until the storage plays along: a full disk or an unreachable bucket pauses the work and loses nothing."""
+        while True:
+            try:
+                return action()
+            except (StaleAttempt, BlobNotFound):
+                raise
+            except Exception as error:
+                self._log.warning("storage is in trouble, trying again", error=f"{type(error).__name__}: {error}")
+            for _ in range(int(RETRY_SECONDS / 0.5)):
+                if self._keeper.ending:
+                    raise Interrupted
+                time.sleep(0.5)

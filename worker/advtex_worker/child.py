@@ -1,0 +1,92 @@
+"""The runner as its parent sees it: started, listened to, asked to stop, and its death put into words."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import IO
+
+from advtex_worker.events import STOP_LINE, Event, Request, parse_event
+
+LOG_TAIL_BYTES = 6000
+KEPT_OUT = ("ADVTEX_", "AWS_")  # the runner reads hostile files: it gets no passwords
+
+
+class Child:
+    """A running runner. Made on a thread that lives as long as the child is wanted (`parentage.py`)."""
+
+    def __init__(self, request: Request, log: Path, threads: int) -> None:
+        self._log = log
+        self._lock = threading.Lock()
+        environment = {name: value for name, value in os.environ.items() if not name.startswith(KEPT_OUT)}
+        for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+            environment[name] = str(threads)
+        with log.open("ab") as sink:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "advtex_worker.runner", str(os.getpid())],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=sink,
+                env=environment,
+                start_new_session=True,  # a Ctrl-C in the worker's terminal is not meant for it
+            )
+        self._write(request.line())
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def events(self) -> Iterator[Event]:
+        """What the runner says, until its end of the line closes. A line cut off by its death is dropped."""
+        pipe: IO[bytes] | None = self._process.stdout
+        assert pipe is not None
+        for line in pipe:
+            if not line.endswith(b"\n"):
+                return
+            yield parse_event(line)
+
+    def ask_to_stop(self) -> None:
+        self._write(STOP_LINE)
+
+    def kill(self) -> None:
+        """End it and whatever it started, at once."""
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+
+    def wait(self) -> int:
+        """The return code, negative for a signal. Leftover children are ended too."""
+        code = self._process.wait()
+        self.kill()
+        return code
+
+    def log_tail(self) -> str:
+        """The newest lines of what the runner and its libraries printed."""
+        with self._log.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(0, size - LOG_TAIL_BYTES))
+            return file.read().decode("utf-8", errors="replace")
+
+    def _write(self, line: str) -> None:
+        pipe = self._process.stdin
+        assert pipe is not None
+        with self._lock, suppress(BrokenPipeError):  # its death is noticed where its events are read
+            pipe.write(line.encode())
+            pipe.flush()
+
+
+def death_sentence(code: int) -> str:
+    """How a process ended, for people: its return code as `subprocess` gives it."""
+    if code >= 0:
+        return f"the engine's process ended without a result (exit code {code})"
+    known = {signal.SIGKILL: "was killed (out of memory?)", signal.SIGSEGV: "crashed in native code"}
+    try:
+        signum = signal.Signals(-code)
+    except ValueError:
+        return f"the engine's process was ended by signal {-code}"
+    return f"the engine's process {known.get(signum, 'was ended')}: {signum.name}"

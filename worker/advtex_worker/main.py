@@ -1,0 +1,115 @@
+"""`advtex-worker`: takes jobs from the queue, one at a time, until it is told to go. Settings come from `ADVTEX_*`."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import signal
+import sys
+import time
+from types import FrameType
+from typing import Any
+
+import structlog
+from pydantic import ValidationError
+from redis.exceptions import RedisError
+from rq import Worker
+from rq.exceptions import StopRequested
+from rq.serializers import JSONSerializer
+
+from advtex_store.queue import QUEUE, connect_redis
+from advtex_worker.parentage import die_with_parent
+from advtex_worker.settings import WorkerSettings
+from advtex_worker.tasks import Host, serve_as
+
+RECONNECT_SECONDS = 2.0
+STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
+
+log = structlog.get_logger()
+
+
+class JobWorker(Worker):
+    """RQ's worker with three changes: it hands stop signals on to its work-horse instead of waiting for it or killing
+    it, its work-horse does not outlive it, and losing Redis in the middle of a job changes nothing.
+    """
+
+    def __init__(self, host: Host, connection: Any) -> None:
+        super().__init__([QUEUE], connection=connection, serializer=JSONSerializer)
+        self._host = host
+        self.told_to_stop = False
+        self._parent_pid = os.getpid()
+
+    def request_stop(self, _signum: int, _frame: FrameType | None) -> None:
+        """The horse checkpoints and gives its job back; without one, the worker ends at once. May come repeatedly."""
+        self.told_to_stop = self._stop_requested = True
+        if self.horse_pid:
+            os.kill(self.horse_pid, signal.SIGTERM)
+        else:
+            raise StopRequested
+
+    def fork_work_horse(self, job: Any, queue: Any) -> None:
+        """Signals wait until both processes know which one they are."""
+        signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
+        try:
+            super().fork_work_horse(job, queue)
+        finally:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)
+
+    def setup_work_horse_signals(self) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        self._host.stop_signal.install()
+        die_with_parent(self._parent_pid, signal.SIGTERM)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)
+        serve_as(self._host)
+
+    def maintain_heartbeats(self, job: Any) -> None:
+        try:
+            super().maintain_heartbeats(job)
+        except RedisError as error:
+            log.warning("Redis is away; the running job is not affected", error=str(error))
+
+    def set_current_job_working_time(self, current_job_working_time: float, pipeline: Any = None) -> None:
+        try:
+            super().set_current_job_working_time(current_job_working_time, pipeline)
+        except RedisError as error:
+            log.warning("Redis is away; the running job is not affected", error=str(error))
+
+
+def work(host: Host) -> None:
+    """Serve the queue until SIGTERM or SIGINT; a Redis that goes away is waited for."""
+    while True:
+        worker = JobWorker(host, connect_redis(host.settings))
+        try:
+            worker.work(logging_level="WARNING")
+            if worker.told_to_stop:
+                return
+            log.warning("the connection to Redis broke; connecting again")
+        except RedisError as error:
+            log.warning("Redis cannot be reached; trying again", error=str(error))
+        except StopRequested:
+            return
+        try:
+            time.sleep(RECONNECT_SECONDS)
+        except StopRequested:  # the handler of the worker that ended
+            return
+
+
+def main() -> None:
+    argparse.ArgumentParser(prog="advtex-worker", description=__doc__).parse_args()
+    try:
+        settings = WorkerSettings()
+    except ValidationError as error:
+        sys.exit(f"advtex-worker: the configuration is wrong: {error}")
+    level = logging.getLevelNamesMapping()[settings.log_level]
+    structlog.configure(
+        wrapper_class=structlog.make_filtering_bound_logger(level),
+        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+    )
+    log.info("worker begins", device=settings.device, threads=settings.threads)
+    work(Host(settings))
+    log.info("worker ends")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,47 @@
+"""Where a run stands, as the user sees it and as the poison rule counts it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from advtex_contract.jobs import Progress
+from advtex_engine.monitor import STAGES
+from advtex_worker.events import ProgressEvent, StageEvent
+
+STAGE_WEIGHT = 10_000_000  # more than any step count
+
+
+class ProgressTracker:
+    """Folds stage and progress events into one view. Not thread-safe: views are immutable and handed over whole."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self.view = Progress()
+        self.reached = 0
+        self._clock = clock
+        self._first: tuple[int, float] | None = None
+
+    def stage(self, event: StageEvent) -> None:
+        if event.seconds is not None:
+            spent = self.view.stage_seconds | {event.stage: round(event.seconds, 3)}
+            self.view = self.view.model_copy(update={"stage_seconds": spent})
+            return
+        self._first = None
+        self.view = self.view.model_copy(update={"stage": event.stage, "eta_seconds": None})
+        self._reach(event.stage, 0)
+
+    def progress(self, event: ProgressEvent) -> None:
+        """The rate is this attempt's own: steps that an earlier attempt made do not count."""
+        now = self._clock()
+        if self._first is None:
+            self._first = (event.step, now)
+        first_step, since = self._first
+        done = event.step - first_step
+        eta = (event.steps - event.step) * (now - since) / done if done > 0 else None
+        update = {"step": event.step, "steps": event.steps, "losses": event.losses, "eta_seconds": eta}
+        self.view = self.view.model_copy(update=update)
+        self._reach(self.view.stage, event.step)
+
+    def _reach(self, stage: str, step: int) -> None:
+        index = STAGES.index(stage) if stage in STAGES else 0
+        self.reached = max(self.reached, index * STAGE_WEIGHT + step)

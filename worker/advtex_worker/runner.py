@@ -1,0 +1,162 @@
+"""The process that owns the device for one attempt: `python -m advtex_worker.runner PARENT_PID`.
+
+It reads a `Request` and then control lines from stdin, and writes events to stdout (`events.py`). It dies with its
+parent. Nothing here knows the queue, the rows or the blobs.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any
+
+from advtex_contract.errors import ErrorDetail
+from advtex_engine.errors import EngineError, OptionError, Problem, ScanError, Stopped
+from advtex_engine.monitor import Monitor
+from advtex_worker.adapt import texture_config
+from advtex_worker.events import (
+    STOP_LINE,
+    CheckpointEvent,
+    Ending,
+    Event,
+    FailedEvent,
+    FinishedEvent,
+    ProgressEvent,
+    Request,
+    StageEvent,
+    StoppedEvent,
+    WarningEvent,
+)
+from advtex_worker.parentage import die_with_parent
+
+ENGINE = "advtex_engine.pipeline:texture_scan"
+
+
+class Reporter(Monitor):
+    """The engine's monitor: tells the parent, and asks nobody but itself whether to stop."""
+
+    def __init__(self, request: Request, events: IO[str], stop: threading.Event) -> None:
+        self._request = request
+        self._events = events
+        self._stop = stop
+        self._snapshots = 0
+
+    def tell(self, event: Event) -> None:
+        self._events.write(event.line())
+        self._events.flush()
+
+    def stage_started(self, stage: str) -> None:
+        self.tell(StageEvent(stage=stage))
+
+    def stage_finished(self, stage: str, seconds: float, _peak_memory_bytes: int) -> None:
+        self.tell(StageEvent(stage=stage, seconds=seconds))
+
+    def progress(self, step: int, steps: int, losses: Mapping[str, float]) -> None:
+        finite = {name: value for name, value in losses.items() if math.isfinite(value)}  # JSON has no others
+        self.tell(ProgressEvent(step=step, steps=steps, losses=finite))
+
+    def warning(self, problem: Problem) -> None:
+        self.tell(WarningEvent(problem=_detail(problem, "warning")))
+
+    def checkpointed(self, files: tuple[Path, ...]) -> None:
+        """The engine replaces files and never changes them, so a hard link keeps this state at no cost."""
+        self._snapshots += 1
+        folder = self._request.snapshots / str(self._snapshots)
+        folder.mkdir(parents=True)
+        kept = {}
+        for number, path in enumerate(files):
+            link = folder / str(number)
+            link.hardlink_to(path)
+            kept[path.relative_to(self._request.work).as_posix()] = link
+        self.tell(CheckpointEvent(files=kept))
+
+    def stop_requested(self) -> bool:
+        return self._stop.is_set()
+
+
+def run(request: Request, reporter: Reporter) -> Ending:
+    """Run the engine and say how it ended. What is not the engine's own error is logged with its traceback."""
+    try:
+        texture_scan = _resolved(request.engine)
+        texture_config(request.options, "cpu")  # options are refused before a device is waited for
+        device, _lock = _device(request.device, reporter)
+        texture_scan(
+            request.scan,
+            request.out,
+            texture_config(request.options, device),
+            work=request.work,
+            resume=request.resume,
+            monitor=reporter,
+        )
+    except Stopped:
+        return StoppedEvent()
+    except ScanError as error:
+        problems = [_detail(problem, "error") for problem in error.problems]
+        return FailedEvent(code="invalid_scan", message=str(error), details=problems)
+    except OptionError as error:
+        return FailedEvent(code="invalid_options", message=str(error))
+    except EngineError as error:
+        traceback.print_exc()
+        return FailedEvent(code="engine_error", message=str(error))
+    except Exception as error:
+        traceback.print_exc()
+        if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":  # torch's own class
+            remedy = "choose a smaller --size or --max-texture-size, or a machine with more memory"
+            return FailedEvent(code="out_of_memory", message=f"the engine ran out of memory: {error}; {remedy}")
+        return FailedEvent(code="engine_error", message=f"the engine failed: {type(error).__name__}: {error}")
+    return FinishedEvent()
+
+
+def _resolved(engine: str) -> Any:
+    module, _, function = engine.partition(":")
+    return getattr(importlib.import_module(module), function)
+
+
+def _device(wanted: str, reporter: Reporter) -> tuple[str, object]:
+    """The device and its lock, which must be kept while the engine runs."""
+    if wanted == "cpu":
+        return "cpu", None
+    from advtex_worker import devices  # torch is imported by the process that needs it, and only then
+
+    taken = devices.acquire(wanted, reporter.stop_requested)
+    if taken is None:
+        raise Stopped
+    return taken
+
+
+def _detail(problem: Problem, severity: Any) -> ErrorDetail:
+    return ErrorDetail(
+        severity=severity, code=problem.code, where=problem.where, message=problem.message, remedy=problem.remedy
+    )
+
+
+def _listen(control: IO[str], stop: threading.Event) -> None:
+    for line in control:
+        if line == STOP_LINE:
+            stop.set()
+    stop.set()  # the parent closed the line
+
+
+def main() -> None:
+    die_with_parent(int(sys.argv[1]), signal.SIGKILL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    events = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # stray prints belong in the log
+    request = Request.model_validate_json(sys.stdin.readline())
+    stop = threading.Event()
+    threading.Thread(target=_listen, args=(sys.stdin, stop), daemon=True).start()
+    reporter = Reporter(request, events, stop)
+    reporter.tell(run(request, reporter))
+    sys.stderr.flush()
+    os._exit(0)  # no destructor of a native library may spoil a finished run
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,29 @@
+"""What a worker needs to know beyond the store's settings; also read from `ADVTEX_*` variables."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from pydantic import Field
+
+from advtex_store.settings import StoreSettings
+
+
+class WorkerSettings(StoreSettings):
+    """Settings of one worker.
+
+    work_dir: scratch space of running attempts, `<data_dir>/work` by default; emptied when a worker starts.
+    """
+
+    device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="where the engine computes")
+    work_dir: Path | None = None
+    threads: int = Field(default_factory=lambda: len(os.sched_getaffinity(0)), ge=1, description="of the engine")
+    grace_seconds: float = Field(default=30.0, gt=0, description="a runner that was asked to stop is killed after this")
+    heartbeat_seconds: float = Field(default=0.5, gt=0, description="between renewals of the lease")
+    log_level: str = Field(default="INFO", pattern=r"^(DEBUG|INFO|WARNING|ERROR)$")
+
+    @property
+    def workspaces(self) -> Path:
+        """The folder that holds one folder per running attempt."""
+        return self.work_dir or self.data_dir / "work"

@@ -21,7 +21,7 @@ from types import TracebackType
 from typing import IO, Self
 from urllib.parse import unquote, urlsplit
 
-from advtex_store.errors import BlobNotFound, NoSpace, StoreError
+from advtex_store.errors import BlobNotFound, BlobsUnavailable, NoSpace
 
 CHUNK = 1 << 20
 _KEY = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*(/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
@@ -228,13 +228,13 @@ class FolderBlobs(Blobs):
 
     def stream(self, key: str, start: int = 0, end: int | None = None) -> Iterator[bytes]:
         try:
-            file = self._path(key).open("rb")
+            file = self.path(key).open("rb")
         except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
             raise BlobNotFound(key) from None
         return _read(file, start, end)
 
     def head(self, key: str) -> BlobInfo:
-        path = self._path(key)
+        path = self.path(key)
         try:
             stat = path.stat()
         except (FileNotFoundError, NotADirectoryError):
@@ -244,13 +244,13 @@ class FolderBlobs(Blobs):
         return BlobInfo(key, stat.st_size, f"{stat.st_mtime_ns:x}-{stat.st_size:x}-{stat.st_ino:x}")
 
     def list(self, prefix: str) -> Iterator[BlobInfo]:
-        folder = self._path(_check_prefix(prefix))
+        folder = self.path(check_prefix(prefix))
         for path in sorted(folder.rglob("*"), key=lambda p: p.as_posix()):
             with suppress(BlobNotFound):
                 yield self.head(path.relative_to(self.root).as_posix())
 
     def delete(self, key: str) -> None:
-        path = self._path(key)
+        path = self.path(key)
         path.unlink(missing_ok=True)
         for parent in path.parents:
             if parent == self.root:
@@ -266,7 +266,7 @@ class FolderBlobs(Blobs):
             with tempfile.TemporaryFile(dir=self.spool_dir) as file:
                 file.write(b"x")
         except OSError as error:
-            raise StoreError(f"the folder {self.root} cannot be written to: {error.strerror}") from error
+            raise BlobsUnavailable(f"the folder {self.root} cannot be written to: {error.strerror}") from error
 
     def _publish(self, path: Path, key: str) -> None:
         self._make_parents(key)
@@ -274,7 +274,8 @@ class FolderBlobs(Blobs):
         path.replace(target)
         _fsync_dir(target.parent)
 
-    def _path(self, key: str) -> Path:
+    def path(self, key: str) -> Path:
+        """Where the blob lies, or would."""
         return self.root / check_key(key)
 
     def _make_parents(self, key: str) -> None:
@@ -307,7 +308,8 @@ def check_key(key: str) -> str:
     return key
 
 
-def _check_prefix(prefix: str) -> str:
+def check_prefix(prefix: str) -> str:
+    """The prefix without its final slash, ValueError if it has none."""
     if not prefix.endswith("/"):
         raise ValueError(f"a prefix ends in '/': {prefix!r}")
     return check_key(prefix[:-1])

@@ -7,6 +7,7 @@ StoreError
 ├── IdempotencyMismatch   the same key came with another body
 ├── IdempotencyInFlight   the same key is being worked on right now
 ├── BlobNotFound
+├── BlobsUnavailable      the storage cannot be reached now
 └── NoSpace               the disk is full; nothing was kept
 """
 
@@ -43,3 +44,7 @@ class BlobNotFound(StoreError):
 
 class NoSpace(StoreError):
     """The disk is full; the partial file was removed."""
+
+
+class BlobsUnavailable(StoreError):
+    """The blob storage cannot be reached at the moment."""

@@ -32,7 +32,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, and_, select, update
+from sqlalchemy import ColumnElement, and_, func, select, update
 from sqlalchemy.orm import Session
 
 from advtex_contract.errors import ErrorDetail
@@ -224,6 +224,12 @@ class Records:
             now = self.database.now(session)
             query = select(JobRow.id, JobRow.attempt).where(JobRow.state == S.running, JobRow.lease_expires_at < now)
             return [(job_id, attempt) for job_id, attempt in session.execute(query.limit(limit))]
+
+    def count_by_state(self) -> dict[str, int]:
+        """Jobs that are not deleted."""
+        with self.database.read() as session:
+            query = select(JobRow.state, func.count()).where(JobRow.deleted_at.is_(None)).group_by(JobRow.state)
+            return {state: int(count) for state, count in session.execute(query)}
 
     # -- user -----------------------------------------------------------------------------------------------------
 

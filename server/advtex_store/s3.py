@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import obstore
 from obstore.exceptions import AlreadyExistsError, BaseError, NotFoundError, PreconditionError
 from obstore.store import S3Store
 
-from advtex_store.blobs import BlobInfo, Blobs, check_key
-from advtex_store.errors import BlobNotFound, StoreError
+from advtex_store.blobs import BlobInfo, Blobs, check_key, check_prefix
+from advtex_store.errors import BlobNotFound, BlobsUnavailable
 
 PART = 8 << 20  # bytes per part of a multipart upload and per read
 
@@ -28,49 +29,57 @@ class S3Blobs(Blobs):
 
     def put_if_absent(self, key: str, data: bytes) -> bool:
         try:
-            obstore.put(self._store, check_key(key), data, mode="create")
+            with _translated(key):
+                obstore.put(self._store, check_key(key), data, mode="create")
         except (AlreadyExistsError, PreconditionError):
             return False
         return True
 
     def stream(self, key: str, start: int = 0, end: int | None = None) -> Iterator[bytes]:
         size = self.head(key).size
-        stop = size if end is None else min(end, size)
-        return self._ranges(key, start, stop)
+        return self._ranges(key, start, size if end is None else min(end, size))
 
     def _ranges(self, key: str, start: int, stop: int) -> Iterator[bytes]:
         for offset in range(start, stop, PART):
-            try:
-                yield bytes(obstore.get_range(self._store, key, start=offset, end=min(offset + PART, stop)))
-            except (NotFoundError, FileNotFoundError):
-                raise BlobNotFound(key) from None
+            with _translated(key):
+                chunk = bytes(obstore.get_range(self._store, key, start=offset, end=min(offset + PART, stop)))
+            yield chunk
 
     def head(self, key: str) -> BlobInfo:
-        try:
+        with _translated(key):
             meta = obstore.head(self._store, check_key(key))
-        except (NotFoundError, FileNotFoundError):
-            raise BlobNotFound(key) from None
-        return BlobInfo(key, meta["size"], (meta["e_tag"] or "").strip('"'))
+        return _info(meta)
 
     def list(self, prefix: str) -> Iterator[BlobInfo]:
-        if not prefix.endswith("/"):
-            raise ValueError(f"a prefix ends in '/': {prefix!r}")
-        check_key(prefix[:-1])
-        found = [meta for page in obstore.list(self._store, prefix=prefix[:-1]) for meta in page]
-        for meta in sorted(found, key=lambda m: m["path"]):
-            yield BlobInfo(meta["path"], meta["size"], (meta["e_tag"] or "").strip('"'))
+        with _translated(prefix):
+            pages = obstore.list(self._store, prefix=check_prefix(prefix))
+            found = [_info(meta) for page in pages for meta in page]
+        yield from sorted(found, key=lambda info: info.key)
 
     def delete(self, key: str) -> None:
-        try:
+        with suppress(BlobNotFound), _translated(key):
             obstore.delete(self._store, check_key(key))
-        except (NotFoundError, FileNotFoundError):
-            return
 
     def check(self) -> None:
-        try:
+        with _translated(self.bucket):
             obstore.list_with_delimiter(self._store, prefix="jobs/none")
-        except BaseError as error:
-            raise StoreError(f"the bucket {self.bucket} cannot be reached: {error}") from error
 
     def _publish(self, path: Path, key: str) -> None:
-        obstore.put(self._store, key, path, chunk_size=PART, max_concurrency=4)
+        with _translated(key):
+            obstore.put(self._store, key, path, chunk_size=PART, max_concurrency=4)
+
+
+def _info(meta: obstore.ObjectMeta) -> BlobInfo:
+    return BlobInfo(meta["path"], meta["size"], (meta["e_tag"] or "").strip('"'))
+
+
+@contextmanager
+def _translated(key: str) -> Iterator[None]:
+    try:
+        yield
+    except (NotFoundError, FileNotFoundError):
+        raise BlobNotFound(key) from None
+    except (AlreadyExistsError, PreconditionError):
+        raise
+    except BaseError as error:
+        raise BlobsUnavailable(f"the object storage does not answer: {error}") from error

@@ -9,6 +9,8 @@ from advtex_store.errors import IllegalTransition, RecordNotFound
 from advtex_store.ids import new_id
 from advtex_store.models import JobRow, UploadRow
 
+INCOMPLETE_SECONDS = 86400.0  # an upload that is not finished by then is forgotten
+
 
 class Uploads:
     """Scans on their way in."""
@@ -28,7 +30,7 @@ class Uploads:
                 offset=0,
                 filename=filename[:255],
                 created_at=now,
-                expires_at=now + self.retention_seconds,
+                expires_at=now + INCOMPLETE_SECONDS,
             )
             session.add(row)
             return row
@@ -58,6 +60,7 @@ class Uploads:
             if row.sha256 not in (None, sha256):
                 raise IllegalTransition(f"upload {upload_id} is complete with other bytes")
             row.sha256, row.offset = sha256, row.size
+            row.expires_at = self.database.now(session) + self.retention_seconds
             return row
 
     def discard(self, upload_id: str) -> None:

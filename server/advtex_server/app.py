@@ -1,0 +1,70 @@
+"""The application: routes around one `Service`, with the dispatcher beside them."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from importlib.metadata import PackageNotFoundError, version
+
+from fastapi import FastAPI
+
+from advtex_contract.errors import ErrorBody
+from advtex_server import errors
+from advtex_server.access import AccessMiddleware
+from advtex_server.dispatch import Dispatcher
+from advtex_server.metrics import Metrics, MetricsMiddleware
+from advtex_server.routes import health, jobs, uploads
+from advtex_server.service import Service
+from advtex_server.settings import ServerSettings
+from advtex_store.database import upgrade_database
+from advtex_store.store import open_store
+
+
+def create_app(settings: ServerSettings) -> FastAPI:
+    """Nothing is contacted before the application starts; then the schema is brought up to date.
+
+    `app.state.stopping` is set by whoever stops the server, so that open event streams end at once.
+    """
+    store = open_store(settings)
+    dispatcher = Dispatcher(store, settings)
+    metrics = Metrics()
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        await asyncio.to_thread(upgrade_database, settings.database)
+        task = asyncio.create_task(dispatcher.run())
+        yield
+        app.state.stopping.set()
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+        store.close()
+
+    app = FastAPI(
+        title="advtex",
+        version=_version(),
+        summary="Sharp textures from RGB-D scans",
+        lifespan=lifespan,
+        responses={
+            "4XX": {"model": ErrorBody, "description": "refused"},
+            "5XX": {"model": ErrorBody, "description": "not possible now"},
+        },
+        redoc_url=None,
+    )
+    app.state.service = Service(store, settings, dispatcher.wake)
+    app.state.metrics = metrics
+    app.state.stopping = asyncio.Event()
+    errors.install(app)
+    app.add_middleware(AccessMiddleware, accounts=store.accounts, max_body_bytes=settings.max_body_bytes)
+    app.add_middleware(MetricsMiddleware, metrics=metrics)
+    for module in (uploads, jobs, health):
+        app.include_router(module.router)
+    return app
+
+
+def _version() -> str:
+    try:
+        return version("advtex")
+    except PackageNotFoundError:  # run from a checkout
+        return "0"

@@ -1,0 +1,43 @@
+"""What routes ask for: the service, and the caller with the scope that the route needs."""
+
+from __future__ import annotations
+
+from typing import Annotated, cast
+
+from fastapi import Depends, Request
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+
+from advtex_contract.errors import ErrorCode
+from advtex_server.refusal import ApiError
+from advtex_server.service import Service
+from advtex_store.accounts import Caller
+
+# Only for the API's description: AccessMiddleware has checked the key before any route is entered.
+_bearer = HTTPBearer(auto_error=False, description="`adv_<id>_<secret>`", scheme_name="key")
+_Key = Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
+
+
+def _service(request: Request) -> Service:
+    return cast(Service, request.app.state.service)
+
+
+def reader(request: Request, _key: _Key) -> Caller:
+    """The caller, who may look."""
+    return _with_scope(request, "read")
+
+
+def writer(request: Request, _key: _Key) -> Caller:
+    """The caller, who may change things."""
+    return _with_scope(request, "write")
+
+
+def _with_scope(request: Request, scope: str) -> Caller:
+    caller = cast(Caller, request.state.caller)
+    if scope not in caller.scopes:
+        raise ApiError(ErrorCode.forbidden, f"this key lacks the scope {scope!r}")
+    return caller
+
+
+Reader = Annotated[Caller, Depends(reader)]
+Writer = Annotated[Caller, Depends(writer)]
+TheService = Annotated[Service, Depends(_service)]

@@ -1,0 +1,68 @@
+"""What works and what does not, in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from redis import RedisError
+from sqlalchemy import text
+from sqlalchemy.exc import SQLAlchemyError
+
+from advtex_server.settings import ServerSettings
+from advtex_store.errors import StoreError
+from advtex_store.store import Store
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One part: whether it works, whether the service can do without it for a while, and what is wrong."""
+
+    name: str
+    ok: bool
+    essential: bool
+    message: str = ""
+
+
+def checks(store: Store, settings: ServerSettings) -> list[Check]:
+    """Look at database, blobs, disk and queue."""
+    return [_database(store), _blobs(store), _disk(store, settings), _redis(store)]
+
+
+def _database(store: Store) -> Check:
+    try:
+        with store.database.read() as session:
+            session.execute(text("select id from jobs limit 1"))
+    except SQLAlchemyError as error:
+        return Check("database", False, True, f"the database does not answer: {_first_line(error)}")
+    return Check("database", True, True)
+
+
+def _blobs(store: Store) -> Check:
+    try:
+        store.blobs.check()
+    except StoreError as error:
+        return Check("blobs", False, True, str(error))
+    return Check("blobs", True, True)
+
+
+def _disk(store: Store, settings: ServerSettings) -> Check:
+    try:
+        free = store.blobs.free_bytes()
+    except OSError as error:
+        return Check("disk", False, True, f"the disk cannot be read: {error}")
+    if free < settings.disk_reserve_bytes:
+        message = f"{free >> 20} MiB are free, uploads need {settings.disk_reserve_bytes >> 20} MiB: make room"
+        return Check("disk", False, True, message)
+    return Check("disk", True, True)
+
+
+def _redis(store: Store) -> Check:
+    try:
+        store.queue.redis.ping()
+    except (RedisError, OSError) as error:
+        return Check("redis", False, False, f"Redis does not answer, jobs are accepted and wait: {_first_line(error)}")
+    return Check("redis", True, False)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]

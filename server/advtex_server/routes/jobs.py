@@ -1,0 +1,133 @@
+"""Jobs: create, look at, follow, cancel, retry, delete, and their results."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Header, Path, Query, Request, Response
+from fastapi.responses import StreamingResponse
+
+from advtex_contract.jobs import JobPage, JobSpec, JobState, JobView, Label
+from advtex_server.deps import Reader, TheService, Writer
+from advtex_server.events import stream_events
+from advtex_server.ranges import chosen_range
+
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
+
+JobId = Annotated[str, Path(max_length=64)]
+
+
+@router.post("", status_code=201, responses={200: {"model": JobView, "description": "the key's job, made before"}})
+def create_job(
+    spec: JobSpec,
+    caller: Writer,
+    service: TheService,
+    response: Response,
+    idempotency_key: Annotated[str | None, Header(min_length=1, max_length=200)] = None,
+) -> JobView:
+    """Texture the scan of a finished upload. A bad scan gives a job in state `rejected` with every finding."""
+    view, new = service.create_job(caller.owner, spec, idempotency_key)
+    if not new:
+        response.status_code = 200
+    response.headers["Location"] = f"/v1/jobs/{view.id}"
+    return view
+
+
+@router.get("")
+def list_jobs(
+    caller: Reader,
+    service: TheService,
+    state: JobState | None = None,
+    label: Label | None = None,
+    cursor: Annotated[str | None, Query(pattern="^[0-9a-f]{1,64}$", description="`next_cursor` of a page")] = None,
+    limit: Annotated[int, Query(ge=1, le=200)] = 50,
+) -> JobPage:
+    """Your jobs, newest first."""
+    return service.jobs(caller.owner, state, label, cursor, limit)
+
+
+@router.get("/{job_id}")
+def get_job(job_id: JobId, caller: Reader, service: TheService) -> JobView:
+    """One job."""
+    return service.job(caller.owner, job_id)
+
+
+@router.post("/{job_id}/cancel")
+def cancel_job(job_id: JobId, caller: Writer, service: TheService) -> JobView:
+    """A waiting job ends at once; a running one is stopped with a checkpoint."""
+    return service.cancel(caller.owner, job_id)
+
+
+@router.post("/{job_id}/retry")
+def retry_job(job_id: JobId, caller: Writer, service: TheService) -> JobView:
+    """A failed or canceled job goes on from its checkpoint."""
+    return service.retry(caller.owner, job_id)
+
+
+@router.delete("/{job_id}", status_code=204)
+def delete_job(job_id: JobId, caller: Writer, service: TheService) -> Response:
+    """Remove an ended job with its results."""
+    service.delete(caller.owner, job_id)
+    return Response(status_code=204)
+
+
+@router.get(
+    "/{job_id}/events",
+    response_class=StreamingResponse,
+    responses={200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}}},
+)
+def job_events(
+    job_id: JobId,
+    caller: Reader,
+    service: TheService,
+    request: Request,
+    last_event_id: Annotated[str, Header(description="replay what came after this event")] = "",
+) -> Response:
+    """Server-sent events until the job has ended.
+
+    `state` and `progress` replay every change of state and of stage (small objects with `kind`); `job` carries the
+    whole job as `GET /v1/jobs/{job_id}` shows it, whenever it has changed. Ids grow.
+    """
+    service.job(caller.owner, job_id)
+    after = int(last_event_id) if last_event_id.isascii() and last_event_id.isdigit() else 0
+    events = stream_events(service, caller.owner, job_id, min(after, 2**62), request.app.state.stopping)
+    headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+    return StreamingResponse(events, media_type="text/event-stream", headers=headers)
+
+
+@router.get(
+    "/{job_id}/results/{name:path}",
+    response_class=StreamingResponse,
+    responses={
+        200: {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}},
+        206: {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}},
+        304: {"description": "unchanged"},
+    },
+)
+def get_result(
+    job_id: JobId,
+    name: str,
+    caller: Reader,
+    service: TheService,
+    range_: Annotated[str, Header(alias="range", description="one byte range")] = "",
+    if_range: Annotated[str, Header()] = "",
+    if_none_match: Annotated[str, Header()] = "",
+) -> Response:
+    """A result file, whole or in part. Its ETag is its SHA-256."""
+    file = service.result(caller.owner, job_id, name)
+    etag = f'"{file.sha256}"'
+    headers = {"ETag": etag, "Accept-Ranges": "bytes", "Cache-Control": "private, no-cache"}
+    if etag in [tag.strip().removeprefix("W/") for tag in if_none_match.split(",")]:
+        return Response(status_code=304, headers=headers)
+    span = chosen_range(range_, file.size) if if_range in ("", etag) else None
+    start, end = span or (0, file.size)
+    headers |= {
+        "Content-Length": str(end - start),
+        "Content-Disposition": f'attachment; filename="{file.name.rpartition("/")[2]}"',
+        "X-Content-SHA256": file.sha256,
+        "X-Content-Type-Options": "nosniff",
+    }
+    if span is not None:
+        headers["Content-Range"] = f"bytes {start}-{end - 1}/{file.size}"
+    body = service.store.blobs.stream(file.key, start, end)
+    return StreamingResponse(body, 200 if span is None else 206, headers, file.content_type)

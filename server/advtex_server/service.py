@@ -1,0 +1,284 @@
+"""The use cases of the API, without HTTP. All calls block; routes make them in threads."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from urllib.parse import quote
+
+import structlog
+
+from advtex_contract.errors import ErrorCode, ErrorDetail
+from advtex_contract.jobs import (
+    JobError,
+    JobPage,
+    JobSpec,
+    JobState,
+    JobView,
+    Progress,
+    ResultFile,
+    StorageInfo,
+    UploadView,
+)
+from advtex_contract.options import JobOptions
+from advtex_scan.check import check_scan
+from advtex_server.refusal import ApiError
+from advtex_server.settings import ServerSettings
+from advtex_store import keys
+from advtex_store.blobs import FolderBlobs
+from advtex_store.errors import BlobNotFound
+from advtex_store.models import JobRow, UploadRow
+from advtex_store.records import WAITING
+from advtex_store.results import StoredFile
+from advtex_store.store import Store
+from advtex_store.submissions import Reservation
+
+log = structlog.get_logger("advtex.server")
+
+
+class Incoming:
+    """An upload whose bytes are arriving. `write` and `finish` block."""
+
+    def __init__(self, service: Service, row: UploadRow, sha256: str | None) -> None:
+        self._service = service
+        self._sha256 = sha256
+        self.row = row
+        self.writer = service.store.blobs.create(keys.scan_key(row.id))
+
+    def write(self, chunk: bytes) -> None:
+        """Append; ApiError `too_large` beyond the announced size, NoSpace on a full disk."""
+        if self.writer.size + len(chunk) > self.row.size:
+            raise ApiError(ErrorCode.too_large, f"more bytes came than the announced {self.row.size}")
+        self.writer.write(chunk)
+
+    def finish(self) -> UploadView:
+        """Durable from here on. ApiError if bytes are missing or are not those that were announced."""
+        if self.writer.size != self.row.size:
+            raise ApiError(ErrorCode.bad_request, f"{self.writer.size} bytes came, {self.row.size} were announced")
+        if self._sha256 is not None and self.writer.sha256 != self._sha256:
+            raise ApiError(
+                ErrorCode.checksum_mismatch,
+                f"the bytes have sha256 {self.writer.sha256}, announced was {self._sha256}; send them again",
+            )
+        written = self.writer.commit()
+        log.info("upload complete", upload=self.row.id, bytes=written.size, sha256=written.sha256)
+        return upload_view(self._service.store.uploads.finish(self.row.id, written.sha256))
+
+
+class Service:
+    """What a caller can do. `wake` is called when a job has been queued."""
+
+    def __init__(self, store: Store, settings: ServerSettings, wake: Callable[[], None] = lambda: None) -> None:
+        self.store = store
+        self.settings = settings
+        self.wake = wake
+        self._lock = threading.Lock()
+        self._expected_bytes = 0
+
+    # -- uploads --------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def incoming(self, owner: str, size: int, filename: str, sha256: str | None) -> Iterator[Incoming]:
+        """Room for an upload is held inside the block; leaving it without `finish` keeps nothing."""
+        if size > self.settings.max_upload_bytes:
+            raise ApiError(ErrorCode.too_large, f"uploads may have {self.settings.max_upload_bytes} bytes at most")
+        if size == 0:
+            raise ApiError(ErrorCode.bad_request, "the upload is empty")
+        with self._lock:
+            free = self.store.blobs.free_bytes() - self._expected_bytes
+            if free - size < self.settings.disk_reserve_bytes:
+                raise ApiError(ErrorCode.insufficient_storage, f"no room for {size} bytes on the server's disk")
+            self._expected_bytes += size
+        try:
+            row = self.store.uploads.create(owner, size, filename)
+            try:
+                incoming = Incoming(self, row, sha256)
+                with incoming.writer:
+                    yield incoming
+            except BaseException:
+                self.store.uploads.discard(row.id)
+                raise
+        finally:
+            with self._lock:
+                self._expected_bytes -= size
+
+    def upload(self, owner: str, upload_id: str) -> UploadView:
+        return upload_view(self.store.uploads.upload(upload_id, owner))
+
+    def delete_upload(self, owner: str, upload_id: str) -> None:
+        self.store.uploads.delete(upload_id, owner)
+
+    def storage(self) -> StorageInfo:
+        return StorageInfo(
+            max_upload_bytes=self.settings.max_upload_bytes, retention_seconds=self.settings.retention_seconds
+        )
+
+    # -- jobs -----------------------------------------------------------------------------------------------------
+
+    def create_job(self, owner: str, spec: JobSpec, token: str | None) -> tuple[JobView, bool]:
+        """Check the scan and queue the job, or record it as rejected. -> the job, and whether it is new."""
+        reservation: Reservation | None = None
+        if token is not None:
+            held = self.store.submissions.reserve(owner, token, hashlib.sha256(_canonical(spec)).hexdigest())
+            if isinstance(held, JobRow):
+                if held.deleted_at is not None:
+                    raise ApiError(ErrorCode.conflict, "the job of this idempotency key was deleted; use a new key")
+                return job_view(held), False
+            reservation = held
+        try:
+            row = self._checked_job(owner, spec, reservation)
+        except BaseException:
+            if reservation is not None:
+                self.store.submissions.release(reservation)
+            raise
+        log.info("job created", job=row.id, state=row.state, upload=row.upload_id)
+        self.wake()
+        return job_view(row), True
+
+    def job(self, owner: str, job_id: str) -> JobView:
+        return job_view(self.store.records.job(job_id, owner))
+
+    def jobs(self, owner: str, state: JobState | None, label: str | None, cursor: str | None, limit: int) -> JobPage:
+        rows, following = self.store.submissions.list_jobs(owner, state=state, label=label, cursor=cursor, limit=limit)
+        return JobPage(jobs=[job_view(row) for row in rows], next_cursor=following)
+
+    def cancel(self, owner: str, job_id: str) -> JobView:
+        view = job_view(self.store.records.cancel(job_id, owner))
+        log.info("cancel asked", job=job_id, state=view.state)
+        return view
+
+    def retry(self, owner: str, job_id: str) -> JobView:
+        view = job_view(self.store.records.retry(job_id, owner))
+        log.info("retry", job=job_id)
+        self.wake()
+        return view
+
+    def delete(self, owner: str, job_id: str) -> None:
+        self.store.records.delete(job_id, owner)
+        log.info("job deleted", job=job_id)
+
+    def result(self, owner: str, job_id: str, name: str) -> StoredFile:
+        """A file of a succeeded job."""
+        row = self.store.records.job(job_id, owner)
+        for entry in row.results:
+            if entry["name"] == name:
+                return StoredFile.model_validate(entry)
+        if row.state != JobState.succeeded:
+            raise ApiError(ErrorCode.not_ready, f"job {job_id} is {row.state}: it has no results")
+        raise ApiError(ErrorCode.not_found, f"job {job_id} has no result {name!r}")
+
+    # -- inside ---------------------------------------------------------------------------------------------------
+
+    def _checked_job(self, owner: str, spec: JobSpec, reservation: Reservation | None) -> JobRow:
+        upload = self.store.uploads.upload(spec.upload_id, owner)
+        if upload.sha256 is None:
+            raise ApiError(ErrorCode.not_ready, f"upload {upload.id} is not complete: {upload.offset} of {upload.size}")
+        with self._local_scan(upload) as path:
+            report = check_scan(path)
+        details = [
+            ErrorDetail(severity=f.severity, code=f.code, where=f.where, message=f.message, remedy=f.remedy)
+            for f in report.findings
+        ]
+        if report.ok:
+            return self.store.submissions.create_job(owner, spec, warnings=details, reservation=reservation)
+        count = sum(detail.severity == "error" for detail in details)
+        rejection = JobError(
+            code=ErrorCode.invalid_scan,
+            details=details,
+            message=f"the scan cannot be textured: {count} problem{'s' if count != 1 else ''} found",
+        )
+        return self.store.submissions.create_job(owner, spec, rejection=rejection, reservation=reservation)
+
+    @contextmanager
+    def _local_scan(self, upload: UploadRow) -> Iterator[Path]:
+        blobs, key = self.store.blobs, keys.scan_key(upload.id)
+        if isinstance(blobs, FolderBlobs):
+            if not blobs.exists(key):
+                raise BlobNotFound(key)
+            yield blobs.path(key)
+            return
+        blobs.spool_dir.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=blobs.spool_dir) as folder:
+            path = Path(folder) / "scan.zip"
+            blobs.fetch(key, path)
+            yield path
+
+
+def job_view(row: JobRow) -> JobView:
+    """The row as the API shows it."""
+    state = JobState(row.state)
+    results = [
+        ResultFile(
+            name=f["name"],
+            size=f["size"],
+            sha256=f["sha256"],
+            content_type=f["content_type"],
+            url=f"/v1/jobs/{row.id}/results/{quote(f['name'])}",
+        )
+        for f in row.results
+    ]
+    return JobView(
+        id=row.id,
+        state=state,
+        label=row.label,
+        upload_id=row.upload_id,
+        options=JobOptions.model_validate(row.options),
+        attempt=row.attempt - 1 if state in WAITING else row.attempt,
+        progress=Progress.model_validate(row.progress),
+        warnings=[ErrorDetail.model_validate(w) for w in row.warnings],
+        error=JobError.model_validate(row.error) if row.error else None,
+        results=results,
+        created_at=_time(row.created_at),
+        updated_at=_time(row.updated_at),
+        finished_at=_time(row.finished_at) if row.finished_at else None,
+        expires_at=_time(row.expires_at) if row.expires_at else None,
+    )
+
+
+def upload_view(row: UploadRow) -> UploadView:
+    """The row as the API shows it."""
+    return UploadView(
+        id=row.id,
+        size=row.size,
+        offset=row.offset,
+        complete=row.sha256 is not None,
+        sha256=row.sha256,
+        filename=row.filename,
+        created_at=_time(row.created_at),
+        expires_at=_time(row.expires_at) if row.expires_at else None,
+    )
+
+
+def announced_sha256(content_digest: str | None, x_content_sha256: str | None) -> str | None:
+    """The SHA-256 (hexadecimal) that a request announces: RFC 9530 `Content-Digest: sha-256=:…:`, or plain hex."""
+    if x_content_sha256 is not None:
+        value = x_content_sha256.strip().lower()
+        if len(value) != 64 or set(value) - set("0123456789abcdef"):
+            raise ApiError(ErrorCode.bad_request, "X-Content-SHA256 must be 64 hexadecimal digits")
+        return value
+    for member in (content_digest or "").split(","):
+        name, _, value = member.strip().partition("=")
+        if name == "sha-256":
+            try:
+                digest = base64.b64decode(value.strip(":"), validate=True)
+            except binascii.Error:
+                digest = b""
+            if len(digest) != 32 or not (value.startswith(":") and value.endswith(":")):
+                raise ApiError(ErrorCode.bad_request, "Content-Digest must be sha-256=:base64 of 32 bytes:")
+            return digest.hex()
+    return None
+
+
+def _canonical(spec: JobSpec) -> bytes:
+    return spec.model_dump_json().encode()
+
+
+def _time(seconds: float) -> datetime:
+    return datetime.fromtimestamp(seconds, UTC)

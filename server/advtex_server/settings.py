@@ -1,0 +1,19 @@
+"""Settings of the server: those of the store and its own, all from `ADVTEX_*` variables."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from advtex_store.settings import StoreSettings
+
+
+class ServerSettings(StoreSettings):
+    """Limits and rhythms. Bytes and seconds."""
+
+    max_upload_bytes: int = Field(default=32 << 30, gt=0)
+    disk_reserve_bytes: int = Field(default=1 << 30, ge=0, description="uploads that would leave less are refused")
+    max_body_bytes: int = Field(default=1 << 20, gt=0, description="of requests that are not uploads")
+    dispatch_seconds: float = Field(default=1.0, gt=0, description="between looks at waiting jobs")
+    reconcile_seconds: float = Field(default=10.0, gt=0, description="between looks at leases and old blobs")
+    queue_depth: int = Field(default=32, gt=0, description="attempts offered to Redis at a time")
+    shutdown_seconds: int = Field(default=5, gt=0, description="open requests get this long when the server stops")

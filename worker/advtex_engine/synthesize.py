@@ -15,9 +15,13 @@ uniform in [-e_g, e_g], smoothed by three Laplacian steps, and moves by it along
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import tempfile
 import zipfile
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,9 +34,11 @@ from numpy.typing import NDArray
 from advtex_engine import synthetic_object
 from advtex_engine.cameras import camera_to_world
 from advtex_engine.export import export_model, vertex_normals
-from advtex_engine.previews import render_view
+from advtex_engine.meshio import read_obj
+from advtex_engine.metrics import score_views
+from advtex_engine.previews import render_layers, render_view
 from advtex_engine.rasterize import rasterize
-from advtex_engine.scene import Camera, Mesh
+from advtex_engine.scene import Atlas, Camera, Mesh
 
 CAMERA_ERROR = 0.003
 """e_t in metres. At half a metre this shifts the image by up to 2 pixels of a 320x240 frame per axis, and the turn that
@@ -99,29 +105,84 @@ def synthesize(
         folder.rename(out)
 
 
+def compare_to_truth(model: Path, scan: Path) -> dict[str, float]:
+    """How close a result came to the truth: `score_views` of the model against the true object.
+
+    model: an OBJ that `export_model` wrote. scan: what `synthesize` wrote, folder or zip. Both objects are rendered from
+    the true held-out cameras; pixels count where both are seen.
+    """
+    truth = json.loads(_member(scan, "truth/cameras.json"))
+    K = np.array(truth["intrinsics_matrix"])
+    ours = _load_model(model.read_bytes(), lambda name: (model.parent / name).read_bytes())
+    theirs = _load_model(_member(scan, "truth/object.obj"), lambda name: _member(scan, f"truth/{name}"))
+    renders, photos, masks = [], [], []
+    for view in truth["heldout"]:
+        world_to_camera = np.linalg.inv(np.array(view["camera_to_world"]))
+        camera = Camera(torch.from_numpy(K), torch.from_numpy(world_to_camera), truth["width"], truth["height"])
+        (render, seen), (photo, there) = (
+            render_layers(atlas, texture, camera, supersample=SUPERSAMPLE) for atlas, texture in (ours, theirs)
+        )
+        renders.append(render)
+        photos.append(photo)
+        masks.append((seen == 1) & (there == 1))
+    return score_views(renders, photos, masks)
+
+
+def _load_model(obj: bytes, read: Callable[[str], bytes]) -> tuple[Atlas, torch.Tensor]:
+    """An OBJ of triangles with one texture, and that texture [H,W,3] uint8; `read` gets the files that it names."""
+    polygons = read_obj(obj)
+    assert polygons.uv is not None and polygons.uv_corners is not None
+    mesh = Mesh(
+        v_pos=torch.from_numpy(polygons.position).float(),
+        t_pos_idx=torch.from_numpy(polygons.corners).view(-1, 3),
+        v_uv=torch.from_numpy(polygons.uv).float(),
+        t_uv_idx=torch.from_numpy(polygons.uv_corners).view(-1, 3),
+    )
+    mtl = read(_value_of(obj, b"mtllib"))
+    image = cv2.imdecode(np.frombuffer(read(_value_of(mtl, b"map_Kd")), np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    texture = torch.from_numpy(np.ascontiguousarray(image[..., ::-1]))
+    return Atlas(mesh, texture.shape[1], texture.shape[0], "scan", 0), texture
+
+
+def _value_of(text: bytes, key: bytes) -> str:
+    """What follows `key` on the first line that starts with it."""
+    line = next(line for line in text.splitlines() if line.startswith(key + b" "))
+    return line.split(maxsplit=1)[1].decode()
+
+
+def _member(scan: Path, name: str) -> bytes:
+    if scan.is_dir():
+        return (scan / name).read_bytes()
+    with zipfile.ZipFile(scan) as archive:
+        return archive.read(name)
+
+
 def _write_scan(
     folder: Path, views: int, width: int, height: int, seed: int, camera_error: float, geometry_error: float
 ) -> None:
     rng = np.random.default_rng(seed)
-    atlas, texture = synthetic_object.build(seed)
     for name in ("color", "depth", "truth/heldout"):
         (folder / name).mkdir(parents=True)
     shots = _shots(views, width, height, rng, "frame")
-    frames = []
-    for shot in shots:
+    heldout = _shots(HELDOUT_VIEWS, width, height, rng, "heldout", turn=0.37)
+
+    def capture(index: int) -> None:
+        """Write one frame; its randomness is its own, so that frames may be made in any order."""
+        shot, noise = shots[index], np.random.default_rng([seed, index])
         clean = render_view(atlas, texture, shot.camera, supersample=SUPERSAMPLE, background=BACKDROP)
-        _write_png(folder / f"color/{shot.name}.png", _exposed(clean.numpy(), rng))
+        _write_png(folder / f"color/{shot.name}.png", _exposed(clean.numpy(), noise))
         depth = rasterize(atlas.mesh, shot.camera).depth.numpy()
-        _write_png(folder / f"depth/{shot.name}.png", _measured(depth, rng))
-        estimated = _misplaced(camera_to_world(shot.camera).numpy(), camera_error, rng)
-        frames.append(
-            {
-                "name": shot.name,
-                "color": f"color/{shot.name}.png",
-                "depth": f"depth/{shot.name}.png",
-                "camera_to_world": estimated.tolist(),
-            }
-        )
+        _write_png(folder / f"depth/{shot.name}.png", _measured(depth, noise))
+
+    def keep(shot: Shot) -> None:
+        clean = render_view(atlas, texture, shot.camera, supersample=SUPERSAMPLE, background=BACKDROP)
+        _write_png(folder / f"truth/heldout/{shot.name}.png", np.rint(clean.numpy() * 255).astype(np.uint8))
+
+    with _pool() as pool:
+        atlas, texture = synthetic_object.build(seed)
+        list(pool.map(capture, range(views)))
+        list(pool.map(keep, heldout))
     _write_ply(folder / "mesh.ply", _bent(atlas.mesh, geometry_error, rng))
     scan = {
         "version": 1,
@@ -131,21 +192,34 @@ def _write_scan(
         "color_intrinsics": _intrinsics(shots[0].camera),
         "depth_intrinsics": _intrinsics(shots[0].camera),
         "mesh": "mesh.ply",
-        "frames": frames,
+        "frames": [
+            {"color": f"color/{shot.name}.png", "depth": f"depth/{shot.name}.png"}
+            | _pose(shot.name, _misplaced(camera_to_world(shot.camera).numpy(), camera_error, rng))
+            for shot in shots
+        ],
     }
     (folder / "scan.json").write_text(json.dumps(scan, indent=1))
-
-    heldout = _shots(HELDOUT_VIEWS, width, height, np.random.default_rng([seed, 1]), "heldout", turn=0.37)
-    for shot in heldout:
-        clean = render_view(atlas, texture, shot.camera, supersample=SUPERSAMPLE, background=BACKDROP)
-        _write_png(folder / f"truth/heldout/{shot.name}.png", np.rint(clean.numpy() * 255).astype(np.uint8))
     export_model(folder / "truth", atlas, texture, up_axis="+z", name="object")
     truth = {
-        "color_intrinsics": _intrinsics(shots[0].camera),
-        "frames": [_pose(shot) for shot in shots],
-        "heldout": [_pose(shot) for shot in heldout],
+        "width": width,
+        "height": height,
+        "intrinsics_matrix": shots[0].camera.K.tolist(),
+        "frames": [_pose(shot.name, camera_to_world(shot.camera).numpy()) for shot in shots],
+        "heldout": [_pose(shot.name, camera_to_world(shot.camera).numpy()) for shot in heldout],
     }
     (folder / "truth/cameras.json").write_text(json.dumps(truth, indent=1))
+
+
+@contextmanager
+def _pool() -> Iterator[ThreadPoolExecutor]:
+    """One thread per core, each with its own view: a view's tensors are too small to be shared among threads."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            yield pool
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _shots(count: int, width: int, height: int, rng: np.random.Generator, prefix: str, turn: float = 0.0) -> list[Shot]:
@@ -227,8 +301,8 @@ def _intrinsics(camera: Camera) -> dict[str, float | int]:
     }
 
 
-def _pose(shot: Shot) -> dict[str, Any]:
-    return {"name": shot.name, "camera_to_world": camera_to_world(shot.camera).tolist()}
+def _pose(name: str, matrix: NDArray[np.float64]) -> dict[str, Any]:
+    return {"name": name, "camera_to_world": matrix.tolist()}
 
 
 def _write_png(path: Path, image: NDArray[Any]) -> None:

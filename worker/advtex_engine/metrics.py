@@ -1,0 +1,186 @@
+"""How a render differs from a photograph, and a texture from the truth.
+
+Images are [H,W,3] float sRGB in [0,1]; masks are [H,W] bool and say which pixels count. Nothing here is used in the
+optimization. PSNR and SSIM assume perfect alignment and prefer a blurred image to a sharp one that is a pixel off: on
+real scans read the gradient ratio and the distance between patch statistics first, and look.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+LUMINANCE = (0.299, 0.587, 0.114)
+PATCH = 7
+"""Side of the patches that are compared (paper section 4)."""
+SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+PROJECTIONS = 256
+MAX_PSNR = 100.0
+"""Decibels given to equal images."""
+CHUNK_BYTES = 256 << 20
+"""Bound on the distance matrix's part that is held at once."""
+
+
+def psnr(image: Tensor, truth: Tensor, mask: Tensor) -> float:
+    """Peak signal-to-noise ratio in dB over the mask."""
+    _check(image, truth, mask)
+    error = float((image - truth)[mask].double().square().mean())
+    return min(MAX_PSNR, -10 * math.log10(max(error, 1e-30)))
+
+
+def ssim(image: Tensor, truth: Tensor, mask: Tensor) -> float:
+    """Structural similarity (Wang et al. 2004) of the luminance, Gaussian window, mean over the mask.
+
+    The window's weights are those of the masked pixels alone, so nothing outside the mask has any influence.
+    """
+    _check(image, truth, mask)
+    x, y, weight = _luminance(image), _luminance(truth), mask.to(torch.float32)
+    offset = torch.arange(SSIM_WINDOW, dtype=torch.float32, device=image.device) - SSIM_WINDOW // 2
+    window = torch.exp(-offset.square() / (2 * SSIM_SIGMA**2))
+    window = window / window.sum()
+
+    def smooth(values: Tensor) -> Tensor:
+        planes = values[None, None]
+        rows = F.conv2d(planes, window.view(1, 1, -1, 1), padding=(SSIM_WINDOW // 2, 0))
+        return F.conv2d(rows, window.view(1, 1, 1, -1), padding=(0, SSIM_WINDOW // 2))[0, 0]
+
+    share = smooth(weight).clamp(min=1e-8)
+    mean_x, mean_y = smooth(x * weight) / share, smooth(y * weight) / share
+    variance_x = smooth(x * x * weight) / share - mean_x.square()
+    variance_y = smooth(y * y * weight) / share - mean_y.square()
+    covariance = smooth(x * y * weight) / share - mean_x * mean_y
+    likeness = ((2 * mean_x * mean_y + SSIM_C1) * (2 * covariance + SSIM_C2)) / (
+        (mean_x.square() + mean_y.square() + SSIM_C1) * (variance_x + variance_y + SSIM_C2)
+    )
+    return float(likeness[mask].mean())
+
+
+def gradient_ratio(image: Tensor, truth: Tensor, mask: Tensor) -> float:
+    """Mean luminance gradient (Sobel) of the image over that of the truth: below 1 blurred, above 1 noisy or seamy.
+
+    Counts pixels whose whole 3x3 neighborhood lies in the mask; 1 when neither image has a gradient there.
+    """
+    _check(image, truth, mask)
+    inside = eroded(mask, 1)
+    ours, theirs = (float(_sobel(_luminance(picture))[inside].mean()) for picture in (image, truth))
+    return (ours + 1e-6) / (theirs + 1e-6)
+
+
+def sharpness_ratio(image: Tensor, truth: Tensor, mask: Tensor) -> float:
+    """Mean magnitude of the luminance's Laplacian, image over truth: the finest detail alone; otherwise as
+    `gradient_ratio`."""
+    _check(image, truth, mask)
+    inside = eroded(mask, 1)
+    kernel = image.new_tensor([[0.0, 1.0, 0.0], [1.0, -4.0, 1.0], [0.0, 1.0, 0.0]])
+    ours, theirs = (float(_filtered(_luminance(picture), kernel).abs()[inside].mean()) for picture in (image, truth))
+    return (ours + 1e-6) / (theirs + 1e-6)
+
+
+def nearest_patch_loss(image: Tensor, truth: Tensor) -> float:
+    """The paper's nearest patch loss (section 4.1): how far each 7x7 patch of the image is from the truth's nearest.
+
+    L2 distance over the square root of the patch's 147 numbers, in levels of 0 to 255, mean over all patches that lie
+    within the image. The images may differ in size. Cost grows with the product of their pixel counts.
+    """
+    ours, theirs = _patches(image), _patches(truth)
+    # |a - b|^2 = |a|^2 + |b|^2 - 2ab suffers from cancellation unless both sides are centred.
+    center = theirs.mean(0)
+    ours, theirs = ours - center, theirs - center
+    norms = theirs.square().sum(1)
+    rows = max(1, CHUNK_BYTES // (4 * len(theirs)))
+    total = 0.0
+    for part in ours.split(rows):  # type: ignore[no-untyped-call]
+        least = torch.addmm(norms, part, theirs.T, alpha=-2).amin(1) + part.square().sum(1)
+        total += float(least.clamp(min=0).double().sqrt().sum())
+    return total / len(ours) / math.sqrt(ours.shape[1])
+
+
+def sliced_wasserstein(image: Tensor, truth: Tensor, mask: Tensor | None = None, *, seed: int = 0) -> float:
+    """Sliced Wasserstein-1 distance between the images' distributions of 7x7 patches, in levels of 0 to 255.
+
+    Patches become vectors of 147 numbers; along each of PROJECTIONS random unit vectors both sets are sorted and the
+    mean absolute difference is taken. Where things lie does not matter, only what they look like: blur and noise
+    show, a shift does not. mask: patches count that lie in it entirely.
+    """
+    assert image.shape == truth.shape
+    ours, theirs = _patches(image), _patches(truth)
+    if mask is not None:
+        whole = eroded(mask, PATCH // 2)
+        edge = PATCH // 2
+        keep = whole[edge:-edge, edge:-edge].flatten()
+        ours, theirs = ours[keep], theirs[keep]
+    if len(ours) == 0:
+        return math.nan
+    generator = torch.Generator().manual_seed(seed)
+    directions = torch.randn(ours.shape[1], PROJECTIONS, generator=generator).to(ours)
+    directions = directions / directions.norm(dim=0)
+    ordered = ((ours @ directions).sort(dim=0).values, (theirs @ directions).sort(dim=0).values)
+    return float((ordered[0] - ordered[1]).abs().mean())
+
+
+METRICS = {
+    "psnr": psnr,
+    "ssim": ssim,
+    "gradient_ratio": gradient_ratio,
+    "sharpness_ratio": sharpness_ratio,
+    "sliced_wasserstein": sliced_wasserstein,
+}
+
+
+def score_views(renders: Iterable[Tensor], photos: Iterable[Tensor], masks: Iterable[Tensor]) -> dict[str, float]:
+    """Each metric's mean over views: renders and photos [H,W,3] (float in [0,1] or uint8), masks [H,W] bool.
+
+    Views whose mask leaves no 7x7 patch do not count; `views` says how many did. Empty when none did.
+    """
+    scores: list[dict[str, float]] = []
+    for render, photo, mask in zip(renders, photos, masks, strict=True):
+        if not bool(eroded(mask, PATCH // 2).any()):
+            continue
+        pair = (_unit(render), _unit(photo).to(render.device))
+        scores.append({name: metric(*pair, mask.to(render.device)) for name, metric in METRICS.items()})
+    if not scores:
+        return {}
+    means = {name: sum(score[name] for score in scores) / len(scores) for name in METRICS}
+    return means | {"views": float(len(scores))}
+
+
+def eroded(mask: Tensor, radius: int) -> Tensor:
+    """Pixels [H,W] bool whose whole (2 radius + 1)^2 neighborhood lies inside the image and the mask."""
+    outside = F.pad((~mask).to(torch.float32), (radius,) * 4, value=1.0)
+    return F.max_pool2d(outside[None, None], 2 * radius + 1, stride=1)[0, 0] == 0
+
+
+def _check(image: Tensor, truth: Tensor, mask: Tensor) -> None:
+    assert image.ndim == 3 and image.shape[2] == 3
+    assert image.shape == truth.shape and mask.shape == image.shape[:2]
+    assert mask.dtype == torch.bool
+
+
+def _unit(image: Tensor) -> Tensor:
+    return image.to(torch.float32) / (255 if image.dtype == torch.uint8 else 1)
+
+
+def _luminance(image: Tensor) -> Tensor:
+    return image.to(torch.float32) @ torch.tensor(LUMINANCE, device=image.device)
+
+
+def _filtered(plane: Tensor, kernel: Tensor) -> Tensor:
+    padded = F.pad(plane[None, None], (1, 1, 1, 1), mode="replicate")
+    return F.conv2d(padded, kernel[None, None])[0, 0]
+
+
+def _sobel(plane: Tensor) -> Tensor:
+    """Gradient magnitude per pixel."""
+    kernel = plane.new_tensor([[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]]) / 8
+    return torch.hypot(_filtered(plane, kernel), _filtered(plane, kernel.T))
+
+
+def _patches(image: Tensor) -> Tensor:
+    """All 7x7 patches inside the image, row by row, as [N,147] in levels of 0 to 255."""
+    planes = image.to(torch.float32).permute(2, 0, 1)[None] * 255
+    return F.unfold(planes, PATCH)[0].T

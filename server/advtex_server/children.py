@@ -1,0 +1,111 @@
+"""Processes that the all-in-one command starts: they die with it, and are started again when they die first."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+
+import structlog
+
+PR_SET_PDEATHSIG = 1
+RESTART_SECONDS = (1.0, 2.0, 5.0, 10.0, 30.0)  # pauses before further starts of a child that keeps dying
+STEADY_SECONDS = 60.0  # a child that lived this long starts again at the shortest pause
+
+log = structlog.get_logger("advtex.children")
+
+
+class Child:
+    """One process. All methods are called from the main thread: on Linux the death signal is tied to the thread that
+    started the process."""
+
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        environment: Mapping[str, str],
+        *,
+        stdin: Callable[[], str] | None = None,
+        stop_seconds: float,
+    ) -> None:
+        self.name = name
+        self._command = list(command)
+        self._environment = dict(environment)
+        self._stdin = stdin
+        self._stop_seconds = stop_seconds
+        self._process: subprocess.Popen[bytes] | None = None
+        self._started = 0.0
+        self._failures = 0
+        self._next_start = 0.0
+        self._asked = False
+
+    @property
+    def pid(self) -> int | None:
+        """Of the living process."""
+        return self._process.pid if self._process is not None and self._process.poll() is None else None
+
+    def start(self) -> None:
+        """Start it. Its output goes to this process's stderr, so that stdout stays for machine-readable lines."""
+        self._process = subprocess.Popen(
+            self._command,
+            env=self._environment,
+            stdin=subprocess.DEVNULL if self._stdin is None else subprocess.PIPE,
+            stdout=sys.stderr.fileno(),
+            stderr=sys.stderr.fileno(),
+            start_new_session=True,  # Ctrl-C reaches this process only, which stops its children in order
+            preexec_fn=_die_with(os.getpid()),
+        )
+        if self._stdin is not None:
+            assert self._process.stdin is not None
+            with suppress(BrokenPipeError), self._process.stdin as pipe:  # it died; `watch` sees that
+                pipe.write(self._stdin().encode())
+        self._started = time.monotonic()
+        log.info("started", child=self.name, pid=self._process.pid)
+
+    def watch(self) -> None:
+        """Start it again if it has died, after a pause that grows."""
+        if self._process is None or self._process.poll() is None:
+            return
+        now = time.monotonic()
+        if self._next_start == 0.0:
+            self._failures = 0 if now - self._started > STEADY_SECONDS else self._failures + 1
+            pause = RESTART_SECONDS[min(self._failures, len(RESTART_SECONDS)) - 1] if self._failures else 0.0
+            self._next_start = now + pause
+            log.warning("died, starts again", child=self.name, exit_code=self._process.returncode, pause=pause)
+        if now >= self._next_start:
+            self._next_start = 0.0
+            self.start()
+
+    def ask_to_stop(self) -> None:
+        """SIGTERM, once: a second one would make a worker give up what it is just saving."""
+        if not self._asked and self._process is not None and self._process.poll() is None:
+            self._process.send_signal(signal.SIGTERM)
+            self._asked = True
+
+    def wait(self) -> None:
+        """Until it is gone; killed, with its process group, when it takes too long."""
+        if self._process is None:
+            return
+        try:
+            self._process.wait(self._stop_seconds)
+        except subprocess.TimeoutExpired:
+            log.warning("does not stop, killed", child=self.name)
+            os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
+        log.info("stopped", child=self.name, exit_code=self._process.returncode)
+
+
+def _die_with(parent: int) -> Callable[[], None]:
+    libc = ctypes.CDLL(None, use_errno=True)
+
+    def prepare() -> None:
+        libc.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+        if os.getppid() != parent:  # it died before the call above
+            os._exit(1)
+
+    return prepare

@@ -1,0 +1,135 @@
+"""`advtex-server`: run the service, manage its keys, ask how it is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from advtex_server.embedded import SetupError
+from advtex_server.health import checks
+from advtex_server.logs import configure_logs
+from advtex_server.serving import serve as run_server
+from advtex_server.serving import up as run_all
+from advtex_server.settings import ServerSettings
+from advtex_store.accounts import SCOPES, Accounts
+from advtex_store.database import Database, upgrade_database
+from advtex_store.errors import RecordNotFound
+from advtex_store.store import open_store
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="The texturing service. Settings come from ADVTEX_* variables.",
+)
+keys = typer.Typer(no_args_is_help=True, help="API keys.")
+app.add_typer(keys, name="keys")
+
+Host = Annotated[str, typer.Option(help="address to listen on")]
+Port = Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one")]
+
+
+@app.command()
+def up(
+    host: Host = "127.0.0.1",
+    port: Port = 8000,
+    data_dir: Annotated[Path | None, typer.Option(help="where everything is kept")] = None,
+) -> None:
+    """Run everything on this machine: API, Redis, database and one worker."""
+    configure_logs()
+    settings = ServerSettings() if data_dir is None else ServerSettings(data_dir=data_dir)
+    _guarded(run_all, settings, host, port)
+
+
+@app.command()
+def serve(host: Host = "0.0.0.0", port: Port = 8000) -> None:  # noqa: S104  a server in a container
+    """Run the API alone; workers, Redis and database are elsewhere."""
+    configure_logs()
+    _guarded(run_server, ServerSettings(), host, port)
+
+
+@app.command()
+def doctor() -> None:
+    """Say what works and what does not; exit code 1 if work cannot be accepted."""
+    settings = ServerSettings()
+    store = open_store(settings)
+    found = checks(store, settings)
+    store.close()
+    for check in found:
+        typer.echo(f"{'ok  ' if check.ok else 'FAIL'} {check.name}{': ' if check.message else ''}{check.message}")
+    if any(not check.ok and check.essential for check in found):
+        raise typer.Exit(1)
+
+
+@keys.command("create")
+def create_key(
+    name: Annotated[str, typer.Argument(help="whose key it is, for your own list")] = "",
+    owner: Annotated[str | None, typer.Option(help="keys of one owner see the same jobs")] = None,
+    scope: Annotated[list[str] | None, typer.Option(help=f"{', '.join(SCOPES)}; can be given several times")] = None,
+    days: Annotated[int | None, typer.Option(min=1, help="until the key expires")] = None,
+) -> None:
+    """Make a key and print it: it cannot be shown again."""
+    expires = None if days is None else (datetime.now(UTC) + timedelta(days=days)).timestamp()
+    try:
+        typer.echo(_accounts().create_key(name, owner=owner, scopes=scope or ("read", "write"), expires_at=expires))
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
+
+
+@keys.command("list")
+def list_keys() -> None:
+    """One JSON object per key, without secrets."""
+    for row in _accounts().list_keys():
+        typer.echo(
+            json.dumps(
+                {
+                    "id": row.id,
+                    "name": row.name,
+                    "owner": row.owner,
+                    "scopes": row.scopes,
+                    "created_at": row.created_at,
+                    "expires_at": row.expires_at,
+                    "revoked_at": row.revoked_at,
+                }
+            )
+        )
+
+
+@keys.command("revoke")
+def revoke_key(key_id: str) -> None:
+    """Refuse a key from now on. Give its id, the part between the two underscores."""
+    try:
+        _accounts().revoke_key(key_id)
+    except RecordNotFound as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(1) from None
+
+
+def main() -> None:
+    """Entry point."""
+    app()
+
+
+def _accounts() -> Accounts:
+    settings = ServerSettings()
+    upgrade_database(settings.database)
+    return Accounts(Database(settings.database))
+
+
+def _guarded(
+    command: Callable[[ServerSettings, str, int], None], settings: ServerSettings, host: str, port: int
+) -> None:
+    try:
+        command(settings, host, port)
+    except SetupError as error:
+        typer.echo(f"advtex-server: {error}", err=True)
+        raise typer.Exit(1) from None
+
+
+if __name__ == "__main__":
+    main()

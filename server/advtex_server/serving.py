@@ -1,0 +1,158 @@
+"""Running the application: alone (`serve`), or with its Redis and one worker (`up`)."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable, Iterator, Sequence
+
+import uvicorn
+
+from advtex_server.app import create_app
+from advtex_server.children import Child
+from advtex_server.embedded import EmbeddedRedis, SetupError, client_key, only_one
+from advtex_server.settings import ServerSettings
+from advtex_store.accounts import Accounts
+from advtex_store.database import Database, upgrade_database
+
+WORKER_STOP_SECONDS = 60.0  # a worker writes its checkpoint in this time
+WATCH_SECONDS = 0.5
+
+
+class _Server(uvicorn.Server):
+    """Signals are handled in `run`: uvicorn would raise them again at its end, before the children are stopped."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+
+def serve(settings: ServerSettings, host: str, port: int) -> None:
+    """The API with its dispatcher, until a signal comes."""
+    with _listen(host, port) as listener:
+        run(settings, listener, [], lambda: _say_ready(settings, _url(listener)))
+
+
+def up(settings: ServerSettings, host: str, port: int) -> None:
+    """Everything on this machine: Redis, database, one key, one worker, and the API. SetupError."""
+    with only_one(settings.data_dir), _listen(host, port) as listener:
+        children = []
+        if "redis_url" not in settings.model_fields_set:
+            embedded = EmbeddedRedis(settings.data_dir)
+            embedded.child.start()
+            children.append(embedded.child)
+            settings = settings.model_copy(
+                update={"redis_url": embedded.url, "redis_password_file": embedded.password_file}
+            )
+        try:
+            if children:
+                embedded.wait_until_ready()
+            upgrade_database(settings.database)
+            database = Database(settings.database)
+            client_key(settings.data_dir, Accounts(database), _url(listener))
+            database.close()
+            worker = Child(
+                "worker",
+                [sys.executable, "-m", "advtex_worker.main"],
+                environment(settings),
+                stop_seconds=WORKER_STOP_SECONDS,
+            )
+            worker.start()
+            children.append(worker)
+        except BaseException:
+            for child in reversed(children):
+                child.ask_to_stop()
+                child.wait()
+            raise
+        run(settings, listener, children, lambda: _say_ready(settings, _url(listener)))
+
+
+def run(
+    settings: ServerSettings, listener: socket.socket, children: Sequence[Child], ready: Callable[[], None]
+) -> None:
+    """Serve until SIGTERM or SIGINT; then stop the API and the children, the last one first."""
+    asyncio.run(_run(settings, listener, children, ready))
+
+
+async def _run(
+    settings: ServerSettings, listener: socket.socket, children: Sequence[Child], ready: Callable[[], None]
+) -> None:
+    app = create_app(settings)
+    server = _Server(
+        uvicorn.Config(
+            app,
+            log_config=None,
+            access_log=False,
+            timeout_graceful_shutdown=settings.shutdown_seconds,
+            server_header=False,
+        )
+    )
+
+    def stop() -> None:
+        server.force_exit = server.should_exit  # the second signal does not wait for open requests
+        server.should_exit = True
+        app.state.stopping.set()
+        if children:
+            children[-1].ask_to_stop()
+
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop)
+    watcher = asyncio.create_task(_watch(server, children, ready))
+    try:
+        await server.serve(sockets=[listener])
+    finally:
+        watcher.cancel()
+        for child in reversed(children):
+            child.ask_to_stop()
+            await asyncio.to_thread(child.wait)
+
+
+async def _watch(server: uvicorn.Server, children: Sequence[Child], ready: Callable[[], None]) -> None:
+    while not server.started:
+        await asyncio.sleep(0.02)
+    ready()
+    while not server.should_exit:
+        for child in children:
+            child.watch()
+        await asyncio.sleep(WATCH_SECONDS)
+
+
+def environment(settings: ServerSettings) -> dict[str, str]:
+    """The environment in which a worker finds the same database, blobs and queue."""
+    found = {
+        "ADVTEX_DATA_DIR": str(settings.data_dir.absolute()),
+        "ADVTEX_DATABASE_URL": settings.database,
+        "ADVTEX_BLOB_URL": settings.blobs,
+        "ADVTEX_REDIS_URL": settings.redis_url,
+        "ADVTEX_LEASE_SECONDS": str(settings.lease_seconds),
+    }
+    if settings.redis_password_file is not None:
+        found["ADVTEX_REDIS_PASSWORD_FILE"] = str(settings.redis_password_file.absolute())
+    return dict(os.environ) | found
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    try:
+        return socket.create_server(
+            (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET, backlog=256
+        )
+    except OSError as error:
+        raise SetupError(f"cannot listen on {host}:{port}: {error.strerror}; choose another --port, or 0") from error
+
+
+def _url(listener: socket.socket) -> str:
+    host, port = listener.getsockname()[:2]
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104  compared, not bound
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
+def _say_ready(settings: ServerSettings, url: str) -> None:
+    print(f"advtex is ready at {url} (data in {settings.data_dir})", file=sys.stderr, flush=True)
+    line = {"event": "ready", "url": url, "data_dir": str(settings.data_dir.absolute()), "pid": os.getpid()}
+    print(json.dumps(line), flush=True)

@@ -7,52 +7,47 @@ det(p0, p1, p2). That also holds for corners beside or behind the camera, so not
 more half-plane in the image, because 1/z is linear there: 1/z = n.d / det, n = (p1 - p0) x (p2 - p0).
 
 Faces are cut into rows and rows into pixels: a half-plane bounds a row from the left or from the right, so the pixels
-enumerated are exactly those covered. Edges are inclusive and widened by `_EDGE` of a pixel, more than the rounding of
+enumerated are exactly those covered. Edges are inclusive and widened by `_WIDEN` of a pixel, more than the rounding of
 float64 and far less than that of float32 positions, so meshes are watertight. A pixel goes to the face of least depth;
 where depths agree in their first 24 bits, to the lowest face index. Both sides of a face are visible.
+
+Tables are one tensor per quantity: a gather from a vector is several times cheaper than one from rows or columns.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from advtex_engine.scene import Camera, Fragments, Mesh
 
 NEAR = 0.01  # metres
 MAX_BYTES = 256 << 20
 
-_EDGE = 1e-9  # pixels
-_EDGE_ON = 1e-12  # |det| below this share of the lengths that make it: the plane holds the camera's centre
-_TINY = 1e-30  # stands for a zero divisor: the bound it gives lies far outside of the image, on the right side
+_WIDEN = 1e-9  # pixels
+_EDGE_ON = 1e-12  # a determinant below this share of the lengths that make it: the face is a line or less
+_TINY = 1e-30  # stands for a zero divisor: the bound that it gives lies far outside of the image, on the right side
 
-_FACE_BITS = 29  # float64 has 29 mantissa bits more than float32; a key keeps a face index there
+_FACE_BITS = 29  # the mantissa of float64 is that much longer than the one of float32: room for a face index
+_FACE_MASK = (1 << _FACE_BITS) - 1
 _EMPTY = (1 << 63) - 1
 
-# Peak bytes per item of each enumeration, temporaries included.
-_FACE_BYTES, _SPAN_BYTES, _PIXEL_BYTES = 1200, 400, 80
+_ITEM_BYTES = 600  # peak of all temporaries per face, span or pixel of a block
+# Blocks below torch's grain for threads (32,768): their temporaries stay in a core's second-level cache, and no kernel
+# waits for a second thread, which takes a time slice per kernel where cores are shared with other processes.
+_CPU_BLOCK = 32_000
 
-
-class _Planes(NamedTuple):
-    """Linear functions a u + b v + c of the pixel, per face, float64; u and v are column and row index.
-
-    edges: [3,F,3] (a, b, c) of the edge functions over det: barycentric / z of each corner, >= 0 inside.
-    inverse_depth: [3,F] (a, b, c) of 1/z.
-    """
-
-    edges: Tensor
-    inverse_depth: Tensor
-    valid: Tensor
+_Point = tuple[Tensor, Tensor, Tensor]  # (column u, row v, 1) times z; or the coefficients of a u + b v + c
 
 
 def rasterize(mesh: Mesh, camera: Camera, *, near: float = NEAR, max_bytes: int = MAX_BYTES) -> Fragments:
     """What `camera` sees of `mesh` at its pixel centres, on the device of the mesh.
 
     near: metres; nothing nearer along z is seen. max_bytes: bound on temporary memory, apart from a few words per
-    vertex and per pixel. Not differentiable. Faces without area or with corners that are not finite are not seen.
+    vertex, face and pixel. Not differentiable. Faces without area or with corners that are not finite are not seen.
     """
     return next(rasterize_views(mesh, [camera], near=near, max_bytes=max_bytes))
 
@@ -63,122 +58,172 @@ def rasterize_views(
     """`rasterize` for each camera in turn; the same result, with the work on the mesh done once."""
     assert near > 0
     assert max_bytes > 0
-    assert mesh.t_pos_idx.shape[0] < 1 << _FACE_BITS
-    v_pos = mesh.v_pos.double()
+    assert len(mesh.t_pos_idx) < _FACE_MASK
+    block = max(1, max_bytes // _ITEM_BYTES)
+    if mesh.v_pos.device.type == "cpu":
+        block = min(block, _CPU_BLOCK)
+    positions = mesh.v_pos.double().T.contiguous()
+    corners = mesh.t_pos_idx.T.contiguous()
     for camera in cameras:
-        yield _rasterize(v_pos, mesh.t_pos_idx, camera, near, max_bytes)
+        points, beyond = _image_points(positions, camera, near, block)
+        seen = _in_frustum(beyond, corners, block)
+        nearest = torch.full((camera.height * camera.width,), _EMPTY, dtype=torch.int64, device=positions.device)
+        for part in _blocks(len(seen), block):
+            _draw_faces(nearest, points, corners, seen[part], camera, near, block)
+        yield _resolve(nearest, points, corners, camera, block)
 
 
-def _rasterize(v_pos: Tensor, t_pos_idx: Tensor, camera: Camera, near: float, max_bytes: int) -> Fragments:
-    corners = _homogeneous(v_pos, camera)
-    outside = _outside(corners, camera, near)
-    nearest = torch.full((camera.height * camera.width,), _EMPTY, dtype=torch.int64, device=v_pos.device)
-    step = max(1, max_bytes // _FACE_BYTES)
-    for first in range(0, len(t_pos_idx), step):
-        faces = t_pos_idx[first : first + step]
-        inside = (outside[faces[:, 0]] & outside[faces[:, 1]] & outside[faces[:, 2]]) == 0
-        index = inside.nonzero()[:, 0]
-        _draw(nearest, corners[faces[index]], index + first, camera, near, max_bytes)
-    return _resolve(nearest, corners, t_pos_idx, camera)
+def _image_points(positions: Tensor, camera: Camera, near: float, block: int) -> tuple[Tensor, Tensor]:
+    """World positions [3,V] -> image points [3,V], and [V] uint8: a bit per plane of the frustum that they lie beyond.
 
-
-def _homogeneous(v_pos: Tensor, camera: Camera) -> Tensor:
-    """[V,3] world -> [V,3] undivided image points, column and row index times z, and z."""
-    K = camera.K.to(v_pos.device, torch.float64, copy=True)
-    K[:2] -= 0.5 * K[2]  # from pixel coordinates to indices: integers are centres
+    Image points are (column, row, 1) times z; whole columns and rows are pixel centres, and the frustum is theirs.
+    """
+    K = camera.K.to(positions.device, torch.float64, copy=True)
+    K[:2] -= 0.5 * K[2]
     projection = K @ camera.world_to_camera.to(K)[:3]
-    return v_pos @ projection[:, :3].T + projection[:, 3]
+    points = torch.empty_like(positions)
+    beyond = torch.empty(points.shape[1], dtype=torch.uint8, device=points.device)
+    for part in _blocks(points.shape[1], block):
+        x, y, z = positions[:, part]
+        for axis, (px, py, pz, p1) in enumerate(projection):
+            points[axis, part] = (x * px).add_(y * py).add_(z * pz).add_(p1)
+        u, v, z = points[:, part]
+        tests = (u < 0, v < 0, u > z * (camera.width - 1), v > z * (camera.height - 1), z < near)
+        beyond[part] = sum(test.view(torch.uint8) << plane for plane, test in enumerate(tests))
+    return points, beyond
 
 
-def _outside(corners: Tensor, camera: Camera, near: float) -> Tensor:
-    """[V] uint8, one bit per frustum plane that has the corner outside."""
-    u, v, z = corners.unbind(1)
-    tests = (u < 0, v < 0, u > z * (camera.width - 1), v > z * (camera.height - 1), z < near, ~(z.abs() < torch.inf))
-    code = torch.zeros(len(corners), dtype=torch.uint8, device=corners.device)
-    for bit, test in enumerate(tests):
-        code |= test.to(torch.uint8) << bit
-    return code
+def _in_frustum(beyond: Tensor, corners: Tensor, block: int) -> Tensor:
+    """Indices of the faces whose corners do not all lie beyond one plane of the frustum."""
+    found = []
+    for part in _blocks(corners.shape[1], block):
+        first, second, third = (beyond.index_select(0, corner) for corner in corners[:, part])
+        found.append((first & second & third == 0).nonzero()[:, 0] + part.start)
+    return torch.cat(found) if found else corners.new_empty(0)
 
 
-def _planes(corners: Tensor) -> _Planes:
-    """Corners [F,3,3], undivided -> their `_Planes`, `valid` False for those that cannot be seen."""
-    p = corners.permute(2, 0, 1)  # [3,F,3]: coordinate, face, corner
-    following, last = p[:, :, [1, 2, 0]], p[:, :, [2, 0, 1]]
-    # Exactly antisymmetric in its arguments, so two faces agree on the edge that they share.
-    edges = _cross(following, last)
-    sides = p[:, :, 1:] - p[:, :, :1]
-    normal = _cross(sides[:, :, 0], sides[:, :, 1])
-    det = (p[:, :, 0] * normal).sum(0)
-    scale = p[:, :, 0].norm(dim=0) * sides[:, :, 0].norm(dim=0) * sides[:, :, 1].norm(dim=0)
-    return _Planes(edges / det[None, :, None], normal / det, det.abs() > _EDGE_ON * scale)
+def _face_points(points: Tensor, corners: Tensor, index: Tensor) -> list[_Point]:
+    """The three corners' image points, [F] per coordinate, of the faces `index` [F]."""
+    u, v, z = points
+    vertices = (corner.index_select(0, index) for corner in corners)
+    return [(u.index_select(0, i), v.index_select(0, i), z.index_select(0, i)) for i in vertices]
 
 
-def _cross(p: Tensor, q: Tensor) -> Tensor:
-    return torch.stack([p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]])
+def _cross(p: _Point, q: _Point) -> _Point:
+    """Exactly antisymmetric in float arithmetic, so that two faces agree on the edge that they share."""
+    return (p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0])
 
 
-def _rows(corners: Tensor, camera: Camera, near: float) -> tuple[Tensor, Tensor]:
-    """First row and number of rows, each [F] int64, of each face's bounding box; 0 if it holds no pixel centre."""
-    z = corners[:, :, 2]
-    ahead = z.amin(1) >= near
-    # A face that crosses the near plane may reach anywhere; its half-planes decide row by row.
-    low, high = (corners[:, :, :2] / z[:, :, None]).aminmax(dim=1)
-    low = torch.where(ahead[:, None], torch.ceil(low - _EDGE), 0.0).clamp_(min=0)
-    limit = low.new_tensor([camera.width - 1, camera.height - 1])
-    high = torch.minimum(torch.where(ahead[:, None], torch.floor(high + _EDGE), limit), limit)
-    rows = torch.where(high[:, 0] >= low[:, 0], high[:, 1] - low[:, 1] + 1, 0.0).clamp_(min=0)
-    return low[:, 1].long(), rows.long()
+def _minus(p: _Point, q: _Point) -> _Point:
+    return (p[0] - q[0], p[1] - q[1], p[2] - q[2])
 
 
-def _draw(nearest: Tensor, corners: Tensor, index: Tensor, camera: Camera, near: float, max_bytes: int) -> None:
-    """Faces with corners [F,3,3] and indices [F] into the keys `nearest` [H * W]."""
-    planes = _planes(corners)
-    first_row, rows = _rows(corners, camera, near)
-    kept = (planes.valid & (rows > 0)).nonzero()[:, 0]
-    index, first_row, rows = index[kept], first_row[kept], rows[kept]
-    inverse_depth = planes.inverse_depth[:, kept]
-    a, b, c = planes.edges[:, kept]
-    c = c + _EDGE * (a.abs() + b.abs())
-    near_plane = -inverse_depth
-    near_plane[2] += 1 / near
-    a, b, c = torch.cat([torch.stack([a, b, c]), near_plane[:, :, None]], dim=2).permute(0, 2, 1)  # [4,F] each
-    a = torch.where(a == 0, _TINY, a)
-    slope, offset, is_left = -b / a, -c / a, a > 0
+def _times(p: _Point, factor: Tensor) -> _Point:
+    return (p[0] * factor, p[1] * factor, p[2] * factor)
 
-    for part in _parts(rows, max_bytes // _SPAN_BYTES):
-        face, step = _expand(rows[part])
+
+def _dot(p: _Point, q: _Point) -> Tensor:
+    return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
+
+
+def _planes(p: list[_Point]) -> tuple[list[_Point], _Point, Tensor]:
+    """Corners -> linear functions of the pixel: barycentric / z per corner, 1/z; and which faces have any [F]."""
+    side, other = _minus(p[1], p[0]), _minus(p[2], p[0])
+    normal = _cross(side, other)
+    det = _dot(p[0], normal)
+    valid = det.square() > _EDGE_ON**2 * (_dot(p[0], p[0]) * _dot(side, side) * _dot(other, other))
+    inverse = det.reciprocal()
+    edges = (_cross(p[1], p[2]), _cross(p[2], p[0]), _cross(p[0], p[1]))
+    return [_times(edge, inverse) for edge in edges], _times(normal, inverse), valid
+
+
+def _rows(p: list[_Point], camera: Camera, near: float) -> tuple[Tensor, Tensor]:
+    """First row and number of rows, [F] int64, of each face's bounding box; 0 rows if it holds no pixel centre."""
+    ahead = torch.minimum(torch.minimum(p[0][2], p[1][2]), p[2][2]) >= near
+    boxes = []
+    for axis, size in ((0, camera.width), (1, camera.height)):
+        first, second, third = (corner[axis] / corner[2] for corner in p)
+        low = torch.minimum(torch.minimum(first, second), third).sub_(_WIDEN)
+        high = torch.maximum(torch.maximum(first, second), third).add_(_WIDEN)
+        # A face that crosses the near plane may reach anywhere; its half-planes decide row by row.
+        boxes.append(_centers(torch.where(ahead, low, 0.0), torch.where(ahead, high, size), size))
+    (_, columns), (top, rows) = boxes
+    return top, rows.mul_(columns > 0)
+
+
+def _centers(low: Tensor, high: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """First and number of the integers within [low, high] and [0, size), as int64."""
+    first = size - (size - low.clamp(0, size)).long()
+    return first, (high.clamp(-1, size - 1) + 1).long().sub_(first).clamp_(min=0)
+
+
+def _draw_faces(
+    nearest: Tensor, points: Tensor, corners: Tensor, index: Tensor, camera: Camera, near: float, block: int
+) -> None:
+    """The faces `index` [F] into the keys `nearest` [H * W]."""
+    p = _face_points(points, corners, index)
+    top, rows = _rows(p, camera, near)
+    edges, (du, dv, constant), valid = _planes(p)
+    kept = (valid & (rows > 0)).nonzero()[:, 0]
+    near_plane = (-du, -dv, 1 / near - constant)
+    bounds = [_row_bound(_select(half_plane, kept)) for half_plane in (*edges, near_plane)]
+    du, dv, constant = _select((du, dv, constant), kept)
+    index, top, rows = _select((index, top, rows), kept)
+    for part in _parts(rows, block):
+        face, row = _expand(rows[part], top[part])
         face += part.start
-        row = step + first_row[face]
-        bound = slope[:, face] * row + offset[:, face]
-        left = is_left[:, face]
-        low = torch.where(left, bound, -torch.inf).amax(0).ceil_().clamp_(0, camera.width)
-        high = torch.where(left, torch.inf, bound).amin(0).floor_().clamp_(-1, camera.width - 1)
-        count = (high - low + 1).clamp_(min=0).long()
-        spans = count.nonzero()[:, 0]
-        face, row, low, count = face[spans], row[spans], low[spans], count[spans]
-        grow = inverse_depth[0, face]
-        start = grow * low + (inverse_depth[1, face] * row + inverse_depth[2, face])
-        pixel = row * camera.width + low.long()
-        _draw_spans(nearest, start, grow, pixel, index[face], count, max_bytes)
+        y = row.double()
+        low, high = torch.zeros_like(y), torch.full_like(y, camera.width - 1)
+        for slope, offset, side in bounds:
+            x = slope.index_select(0, face).mul_(y).add_(offset.index_select(0, face))
+            limit = side.index_select(0, face)
+            torch.maximum(low, torch.minimum(x, limit), out=low)
+            torch.minimum(high, torch.maximum(x, limit), out=high)
+        left, count = _centers(low, high, camera.width)
+        step = du.index_select(0, face)
+        start = step * left + dv.index_select(0, face).mul_(y).add_(constant.index_select(0, face))
+        pixel = row.mul_(camera.width).add_(left)
+        _draw_spans(nearest, pixel, count, start, step, index.index_select(0, face), block)
+
+
+def _select(tensors: _Point, index: Tensor) -> _Point:
+    return (tensors[0].index_select(0, index), tensors[1].index_select(0, index), tensors[2].index_select(0, index))
+
+
+def _row_bound(half_plane: _Point) -> _Point:
+    """a u + b v + c >= 0, widened, as a bound u = slope v + offset; and inf where it bounds u from below, else -inf."""
+    a, b, c = half_plane
+    widened = c + _WIDEN * (a.abs() + b.abs())
+    over = torch.where(a == 0, _TINY, a).reciprocal_().neg_()
+    return b * over, widened * over, torch.where(over < 0, torch.inf, -torch.inf)
 
 
 def _draw_spans(
-    nearest: Tensor, start: Tensor, grow: Tensor, pixel: Tensor, index: Tensor, count: Tensor, max_bytes: int
+    nearest: Tensor, pixel: Tensor, count: Tensor, start: Tensor, step: Tensor, index: Tensor, block: int
 ) -> None:
-    """Spans of `count` pixels from `pixel` on, 1/z = start + k grow at the k-th, into the keys `nearest`."""
-    for part in _parts(count, max_bytes // _PIXEL_BYTES):
-        span, step = _expand(count[part])
+    """Spans of `count` pixels, the k-th at `pixel` + k with 1/z = `start` + k `step`, into the keys `nearest`."""
+    for part in _parts(count, block):
+        span, k = _expand(count[part], None)
         span += part.start
-        depth = (start[span] + grow[span] * step).clamp_(min=_TINY).reciprocal_()
-        key = (depth.view(torch.int64) >> _FACE_BITS << _FACE_BITS) | index[span]
-        nearest.scatter_reduce_(0, pixel[span] + step, key, "amin")
+        depth = step.index_select(0, span).mul_(k).add_(start.index_select(0, span)).clamp_(min=_TINY).reciprocal_()
+        key = depth.view(torch.int64).bitwise_and_(~_FACE_MASK).bitwise_or_(index.index_select(0, span))
+        nearest.scatter_reduce_(0, k.add_(pixel.index_select(0, span)), key, "amin")
 
 
-def _expand(count: Tensor) -> tuple[Tensor, Tensor]:
-    """For counts [N]: the item [sum] that each element belongs to, and its place [sum] within the item."""
-    item = torch.repeat_interleave(count)
-    start = count.cumsum(0) - count
-    return item, torch.arange(len(item), device=count.device) - start[item]
+def _expand(count: Tensor, first: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Counts [N] -> for each of the sum(count) elements its item, and its place among the item's, from `first` on."""
+    end = count.cumsum(0)
+    total = int(end[-1])
+    # torch.repeat_interleave(count), without the threads that it starts for the smallest of counts.
+    item = end.new_zeros(total + 1).scatter_add_(0, end, torch.ones_like(end)).cumsum(0)[:total]
+    before = count - end
+    if first is not None:
+        before += first
+    return item, torch.arange(total, device=count.device).add_(before.index_select(0, item))
+
+
+def _blocks(total: int, size: int) -> Iterator[slice]:
+    return (slice(start, min(start + size, total)) for start in range(0, total, size))
 
 
 def _parts(count: Tensor, limit: int) -> Iterator[slice]:
@@ -187,33 +232,45 @@ def _parts(count: Tensor, limit: int) -> Iterator[slice]:
     start = 0
     while start < len(count):
         done = total[start - 1] if start else 0
-        end = int(torch.searchsorted(total, done + limit, right=True))
-        end = max(end, start + 1)
+        end = max(int(torch.searchsorted(total, done + limit, right=True)), start + 1)
         yield slice(start, end)
         start = end
 
 
-def _resolve(nearest: Tensor, corners: Tensor, t_pos_idx: Tensor, camera: Camera) -> Fragments:
-    """Keys [H * W] -> `Fragments`, with depth and barycentrics of each pixel's face computed afresh."""
-    shape = (camera.height, camera.width)
-    hit = (nearest != _EMPTY).nonzero()[:, 0]
-    face = nearest[hit] & ((1 << _FACE_BITS) - 1)
-    visible = torch.zeros(len(t_pos_idx), dtype=torch.bool, device=nearest.device)
-    visible[face] = True
-    order = visible.cumsum(0) - 1
-    planes = _planes(corners[t_pos_idx[visible]])
-    which = order[face]
-    column, row = (hit % camera.width).double(), (hit // camera.width).double()
-    a, b, c = planes.edges[:, which]
-    weights = (a * column[:, None] + b * row[:, None] + c).clamp_(min=0)
-    total = weights.sum(1)
-    a, b, c = planes.inverse_depth[:, which]
-    inverse_depth = a * column + b * row + c
+def _resolve(nearest: Tensor, points: Tensor, corners: Tensor, camera: Camera, block: int) -> Fragments:
+    """Keys [H * W] -> `Fragments`; depth and barycentrics of the pixels' faces are computed afresh from float64."""
+    height, width, device = camera.height, camera.width, nearest.device
+    none = corners.shape[1]
+    visible = torch.zeros(none + 1, dtype=torch.bool, device=device)
+    visible[none] = True
+    for part in _blocks(len(nearest), block):
+        visible.index_fill_(0, nearest[part].bitwise_and_(_FACE_MASK).clamp_(max=none), True)
+    index = torch.cat([visible[part].nonzero()[:, 0] + part.start for part in _blocks(none + 1, block)])
+    place = torch.empty(none + 1, dtype=torch.int64, device=device)
+    place.index_copy_(0, index, torch.arange(len(index), device=device))
+    names = index.int()
+    names[-1] = -1
+    edges, inverse_depth, _ = _planes(_face_points(points, corners, index[:-1]))
+    # The last row is for pixels that see nothing: infinitely far, so depth and all weights / z come out as 0.
+    tables = [pad(table, (0, 1)) for table in (*edges[0], *edges[1], *edges[2], *inverse_depth)]
+    tables[-1][-1] = torch.inf
 
-    face_index = torch.full((len(nearest),), -1, dtype=torch.int32, device=nearest.device)
-    barycentric = torch.zeros((len(nearest), 3), device=nearest.device)
-    depth = torch.zeros(len(nearest), device=nearest.device)
-    face_index[hit] = face.int()
-    barycentric[hit] = (weights / total[:, None]).float()
-    depth[hit] = inverse_depth.reciprocal().float()
-    return Fragments(face_index.view(shape), barycentric.view(*shape, 3), depth.view(shape))
+    face_index = torch.empty((height, width), dtype=torch.int32, device=device)
+    barycentric = torch.empty((height, width, 3), device=device)
+    depth = torch.empty((height, width), device=device)
+    u = torch.arange(width, dtype=torch.float64, device=device)
+    v = torch.arange(height, dtype=torch.float64, device=device)[:, None]
+    for rows in _blocks(height, max(1, block // width)):
+        which = place.index_select(0, nearest[rows.start * width : rows.stop * width])
+        face_index[rows] = names.index_select(0, which).view(-1, width)
+        z = _linear(tables[9:], which, u, v[rows]).reciprocal_()
+        depth[rows] = z
+        for k in range(3):
+            barycentric[rows, :, k] = _linear(tables[3 * k : 3 * k + 3], which, u, v[rows]).mul_(z).clamp_(0, 1)
+    return Fragments(face_index, barycentric, depth)
+
+
+def _linear(coefficients: list[Tensor], which: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """a u + b v + c at rows v [h,1] and columns u [W] -> [h,W], with the coefficients' item `which` [h * W]."""
+    a, b, c = (table.index_select(0, which).view(len(v), len(u)) for table in coefficients)
+    return a.mul_(u).add_(b.mul_(v)).add_(c)

@@ -14,19 +14,18 @@ ASPECT_TOLERANCE = 0.01  # ScanNet's 1296x968 pictures are often resampled to 64
 
 def check_frame(reader: ScanReader, frame: FrameEntry) -> FrameEntry | None:
     """The frame with its color intrinsics at the image's size; None, with a finding, if it cannot be used."""
-    width, height = frame.color_intrinsics.width, frame.color_intrinsics.height
-    if isinstance(frame.color, ByteRange) and frame.color.codec == "raw_rgb8":
-        color = frame.color_intrinsics
-    else:
-        header = _header(reader, frame.color)
-        scaled = _scaled_color(reader, frame, header) if header else None
-        if scaled is None:
-            return None
-        color = scaled
-    sound = frame.depth is None or _depth_is_sound(reader, frame)
-    if not sound:
+    color = _color_camera(reader, frame)
+    depth_is_sound = frame.depth is None or _depth_is_sound(reader, frame)
+    if color is None or not depth_is_sound:
         return None
-    return frame if (color.width, color.height) == (width, height) else replace(frame, color_intrinsics=color)
+    return frame if color is frame.color_intrinsics else replace(frame, color_intrinsics=color)
+
+
+def _color_camera(reader: ScanReader, frame: FrameEntry) -> Intrinsics | None:
+    if isinstance(frame.color, ByteRange) and frame.color.codec == "raw_rgb8":
+        return frame.color_intrinsics
+    header = _header(reader, frame.color)
+    return _scaled_color(reader, frame, header) if header else None
 
 
 def _header(reader: ScanReader, ref: str | ByteRange) -> ImageHeader | None:
@@ -56,15 +55,16 @@ def _depth_is_sound(reader: ScanReader, frame: FrameEntry) -> bool:
     depth, camera = frame.depth, frame.depth_intrinsics
     assert depth is not None
     where = place(depth)
+    raw = isinstance(depth, ByteRange) and depth.codec in ("raw_u16", "zlib_u16")
+    header = None if raw else _header(reader, depth)
+    if header is None and not raw:
+        return False
     if camera is None:
         remedy = "give the depth camera's intrinsics, or leave the depth images out"
         reader.findings.error("no_depth_intrinsics", where, "has depth, but there are no depth intrinsics", remedy)
         return False
-    if isinstance(depth, ByteRange) and depth.codec in ("raw_u16", "zlib_u16"):
-        return True
-    header = _header(reader, depth)
     if header is None:
-        return False
+        return True
     if (header.format, header.bits, header.channels) != ("png", 16, 1):
         message = f"is a {header.format.upper()} with {header.channels} x {header.bits} bits"
         remedy = "store depth as 16-bit gray PNG, or leave it out"

@@ -16,7 +16,7 @@ import zlib
 from collections import OrderedDict, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 from advtex_scan.errors import ArchiveError, Finding
 
@@ -65,8 +65,8 @@ def damaged(name: str, what: str) -> ArchiveError:
 class RangeReader:
     """Reads ranges of the members of one file. Safe to use from several threads at once."""
 
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor = descriptor
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
         self._lock = threading.Lock()
         self._checkpoints: defaultdict[str, list[_State]] = defaultdict(list)
         self._recent: OrderedDict[tuple[str, int], _State] = OrderedDict()
@@ -74,12 +74,12 @@ class RangeReader:
     def read(self, extent: Extent, offset: int, length: int) -> bytes:
         """Return `length` bytes from `offset`; the caller has checked them against the member's size."""
         if not extent.deflated:
-            return _pread(self._descriptor, extent, offset, length)
+            return _pread(self._file, extent, offset, length)
         state = self._nearest(extent.name, offset)
-        for _ in _inflate(self._descriptor, extent, state, offset - state.position):
+        for _ in _inflate(self._file, extent, state, offset - state.position):
             self._keep_checkpoint(extent.name, state)
         pieces = []
-        for piece in _inflate(self._descriptor, extent, state, length):
+        for piece in _inflate(self._file, extent, state, length):
             pieces.append(piece)
             self._keep_checkpoint(extent.name, state)
         if extent.size > CHECKPOINT_BYTES:
@@ -112,9 +112,9 @@ class RangeReader:
 class MemberStream(io.RawIOBase):
     """One pass over a member from its first byte; its length and CRC are checked when the end is reached."""
 
-    def __init__(self, descriptor: int, extent: Extent) -> None:
+    def __init__(self, file: BinaryIO, extent: Extent) -> None:
         super().__init__()
-        self._descriptor = descriptor
+        self._file = file
         self._extent = extent
         self._state = _State()
         self._crc = 0
@@ -127,9 +127,9 @@ class MemberStream(io.RawIOBase):
         position, extent = self._state.position, self._extent
         length = min(len(view), extent.size - position, OUTPUT_CHUNK)
         if extent.deflated:
-            piece = b"".join(_inflate(self._descriptor, extent, self._state, length))
+            piece = b"".join(_inflate(self._file, extent, self._state, length))
         else:
-            piece = _pread(self._descriptor, extent, position, length)
+            piece = _pread(self._file, extent, position, length)
             self._state.position += length
         self._crc = zlib.crc32(piece, self._crc)
         view[:length] = piece
@@ -138,16 +138,16 @@ class MemberStream(io.RawIOBase):
         return length
 
     def _check_end(self) -> None:
-        if self._extent.deflated and _holds_more(self._descriptor, self._extent, self._state):
+        if self._extent.deflated and _holds_more(self._file, self._extent, self._state):
             raise damaged(self._extent.name, f"inflates to more than the {self._extent.size} bytes it claims")
         if self._crc != self._extent.crc:
             raise damaged(self._extent.name, "its checksum is wrong")
 
 
-def _pread(descriptor: int, extent: Extent, offset: int, length: int) -> bytes:
+def _pread(file: BinaryIO, extent: Extent, offset: int, length: int) -> bytes:
     pieces, start, end = [], extent.start + offset, extent.start + offset + length
     while start < end:
-        piece = os.pread(descriptor, end - start, start)
+        piece = os.pread(file.fileno(), end - start, start)
         if not piece:
             raise damaged(extent.name, "the file ends before this member does")
         pieces.append(piece)
@@ -155,19 +155,19 @@ def _pread(descriptor: int, extent: Extent, offset: int, length: int) -> bytes:
     return b"".join(pieces)
 
 
-def _next_input(descriptor: int, extent: Extent, state: _State) -> bytes:
+def _next_input(file: BinaryIO, extent: Extent, state: _State) -> bytes:
     """What the inflater left over, else the next stored bytes; empty at the member's end."""
     if state.inflater.unconsumed_tail:
         return state.inflater.unconsumed_tail
-    piece = _pread(descriptor, extent, state.consumed, min(INPUT_CHUNK, extent.stored - state.consumed))
+    piece = _pread(file, extent, state.consumed, min(INPUT_CHUNK, extent.stored - state.consumed))
     state.consumed += len(piece)
     return piece
 
 
-def _inflate(descriptor: int, extent: Extent, state: _State, length: int) -> Iterator[bytes]:
+def _inflate(file: BinaryIO, extent: Extent, state: _State, length: int) -> Iterator[bytes]:
     """Advance `state` by `length` bytes of output, in pieces of at most OUTPUT_CHUNK."""
     while length > 0:
-        source = _next_input(descriptor, extent, state)
+        source = _next_input(file, extent, state)
         try:
             piece = state.inflater.decompress(source, min(length, OUTPUT_CHUNK))
         except zlib.error as error:
@@ -180,10 +180,10 @@ def _inflate(descriptor: int, extent: Extent, state: _State, length: int) -> Ite
             raise damaged(extent.name, f"inflates to {state.position} bytes, not to the {extent.size} it claims")
 
 
-def _holds_more(descriptor: int, extent: Extent, state: _State) -> bool:
+def _holds_more(file: BinaryIO, extent: Extent, state: _State) -> bool:
     try:
         while not state.inflater.eof:
-            source = _next_input(descriptor, extent, state)
+            source = _next_input(file, extent, state)
             if state.inflater.decompress(source, 1):
                 return True
             if not source:

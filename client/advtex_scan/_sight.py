@@ -16,7 +16,8 @@ SAMPLED_TRIANGLES = 20_000
 SAMPLED_POINTS = 2_000
 SAMPLED_FRAMES = 200
 NEAR = 0.01  # metres
-FAR_FACTOR = 5.0  # cameras further from the mesh's box than this many of its diagonals are in another place or unit
+FAR_FACTOR = 20.0  # cameras further from the mesh's box than this many of its diagonals are in another place or unit
+LARGE_MESH = 200.0  # metres; a hand-held scan is smaller
 GOLDEN = 0.6180339887498949
 
 
@@ -31,6 +32,9 @@ def check_sight(findings: Findings, manifest: ScanManifest, mesh: MeshSurface) -
     if min(distances) > FAR_FACTOR * diagonal:
         message = f"the nearest camera is {min(distances):.2f} m away from a mesh of {diagonal:.2f} m"
         findings.error("mesh_far", mesh.facts.path, message, remedy)
+    if diagonal > LARGE_MESH:
+        message = f"measures {diagonal:.0f} m across"
+        findings.warning("mesh_large", mesh.facts.path, message, "check that it is in metres, not in millimetres")
     step = -(-len(manifest.frames) // SAMPLED_FRAMES)
     tried = manifest.frames[::step]
     points = spread_points(mesh, SAMPLED_POINTS)

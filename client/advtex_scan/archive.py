@@ -85,7 +85,7 @@ class ScanArchive(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Release the files; nothing can be read from a zip afterwards."""
+        """Release the files; reading from a zip afterwards raises ValueError."""
 
     def __enter__(self) -> Self:
         return self
@@ -117,23 +117,21 @@ def open_scan(path: str | os.PathLike[str], limits: ArchiveLimits | None = None)
 
 class _ZipArchive(ScanArchive):
     def __init__(self, path: Path, limits: ArchiveLimits) -> None:
-        self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        self._file = path.open("rb", buffering=0)
         try:
-            extents = read_directory(self._descriptor, path.name, limits)
+            extents = read_directory(self._file.fileno(), path.name, limits)
         except BaseException:
             self.close()
             raise
         self._extents: dict[str, Extent] = extents
-        self._reader = RangeReader(self._descriptor)
+        self._reader = RangeReader(self._file)
         super().__init__(path, {name: extent.size for name, extent in extents.items()})
 
     def close(self) -> None:
-        descriptor, self._descriptor = self._descriptor, -1
-        if descriptor >= 0:
-            os.close(descriptor)
+        self._file.close()
 
     def _stream(self, name: str) -> io.RawIOBase:
-        return MemberStream(self._descriptor, self._extents[name])
+        return MemberStream(self._file, self._extents[name])
 
     def _range(self, name: str, offset: int, length: int) -> bytes:
         return self._reader.read(self._extents[name], offset, length)

@@ -109,7 +109,8 @@ def read_scan(archive: ScanArchive) -> ScanReading:
     if detected is None:
         names = ", ".join(layout.NAME for layout in LAYOUTS)
         remedy = f"write a scan.json, or use one of the layouts {names}"
-        finding = Finding("error", "unknown_layout", "", "the files are of no known layout", remedy)
+        message = "the files are of no known layout" if archive.names() else "there are no files"
+        finding = Finding("error", "unknown_layout", "", message, remedy)
         return ScanReading(None, CheckReport(findings=(finding,)))
     layout, match = detected
     reader = ScanReader(archive)
@@ -152,7 +153,7 @@ def _usable(reader: ScanReader, manifest: ScanManifest) -> ScanManifest:
 
 def _check_mesh(reader: ScanReader, manifest: ScanManifest) -> MeshFacts | None:
     if manifest.mesh is None:
-        if not (reader.findings.count("ambiguous_mesh") or reader.findings.count("missing_file")):
+        if not reader.mesh_reported:
             remedy = "add the scan's reconstruction as mesh.ply, .obj or .glb, in the coordinates of the poses"
             reader.findings.error("no_mesh", "", "there is no mesh", remedy)
         return None

@@ -21,6 +21,7 @@ def choose_mesh(reader: ScanReader, documented: tuple[str, ...]) -> MeshEntry | 
             return MeshEntry(candidates[0])
         if candidates:
             message = f"several files could be the mesh: {', '.join(candidates[:5])}"
+            reader.mesh_reported = True
             reader.findings.error("ambiguous_mesh", candidates[0], message, "name the right one mesh.ply")
             return None
     return None

@@ -10,12 +10,13 @@ from typing import Protocol
 
 from advtex_scan.archive import ScanArchive
 from advtex_scan.errors import Findings, ScanFormatError
-from advtex_scan.images import ImageHeader, read_image_header
+from advtex_scan.images import read_image_header
 from advtex_scan.manifest import FileRef, Intrinsics, Matrix4, ScanManifest
 from advtex_scan.matrices import is_lost, matrix4, pose_problem
 
 TEXT_LIMIT = 1 << 20  # bytes of a pose, intrinsics or info file
 OPENCV_OFFSET = 0.5  # added to the principal point where files count the first pixel's centre as (0, 0)
+SIZE_VOTES = 5  # images that decide for which size intrinsics without a size are
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 
 
@@ -50,6 +51,7 @@ class ScanReader:
         self.used: set[str] = set()
         self.frames_found = 0
         self.dropped: Counter[str] = Counter()
+        self.mesh_reported = False  # a finding says why there is no mesh
 
     def text(self, name: str) -> str | None:
         """A small text file; None, with a finding, if it cannot be read."""
@@ -109,17 +111,30 @@ class ScanReader:
         self.findings.warning(reason, where, message, remedy)
 
     def image_size(self, refs: list[FileRef]) -> tuple[int, int] | None:
-        """Width and height of the first image that has a sound header; the check reports the others."""
-        header = self._first_header(refs)
-        return (header.width, header.height) if header else None
+        """Width and height that most of a few images have; None if no image has a sound header.
 
-    def _first_header(self, refs: list[FileRef]) -> ImageHeader | None:
+        The check of each frame reports the images that differ or are broken.
+        """
+        sizes: Counter[tuple[int, int]] = Counter()
         for ref in refs:
             try:
-                return read_image_header(self.archive, ref)
+                header = read_image_header(self.archive, ref)
             except ScanFormatError:
                 continue
-        return None
+            sizes[header.width, header.height] += 1
+            if sizes.total() == SIZE_VOTES:
+                break
+        return sizes.most_common(1)[0][0] if sizes else None
+
+    def color_size(self, refs: list[FileRef]) -> tuple[int, int] | None:
+        """As `image_size`; if no image is sound, no frame will be checked, so all of them are reported here."""
+        size = self.image_size(refs)
+        for ref in refs if size is None else ():
+            try:
+                read_image_header(self.archive, ref)
+            except ScanFormatError as error:
+                self.findings.extend(error.findings)
+        return size
 
     def matrix_intrinsics(self, name: str, size: tuple[int, int] | None) -> Intrinsics | None:
         """Intrinsics from a 3x3 or 4x4 matrix file that counts the first pixel's centre as (0, 0)."""
@@ -154,6 +169,7 @@ class ScanReader:
 
 def parse_numbers(text: str) -> list[float] | None:
     """All numbers of a text, separated by blanks, commas or semicolons; None if anything else is in it."""
+    text = re.sub(r"1\.#INF\d*", "inf", re.sub(r"1\.#(?:IND|QNAN|SNAN)\d*", "nan", text))  # as old Windows tools print
     try:
         return [float(word) for word in re.split(r"[\s,;]+", text.strip()) if word]
     except ValueError:

@@ -51,7 +51,8 @@ from advtex_scan.matrices import matrix4, pose_problem
 NAME = "native"
 FILE = "scan.json"
 VERSION = 1
-JSON_LIMIT = 64 << 20
+JSON_LIMIT = 16 << 20
+MAX_FRAMES = 100_000
 SCAN_KEYS = frozenset(
     [
         "version",
@@ -84,6 +85,10 @@ def read(reader: ScanReader) -> ScanManifest | None:
     frames = scan.get("frames")
     if not isinstance(frames, list):
         reader.findings.error("bad_value", f"{FILE}: frames", "is missing or no list", "list the frames")
+        frames = []
+    if len(frames) > MAX_FRAMES:
+        message = f"lists {len(frames)} frames; at most {MAX_FRAMES} are accepted"
+        reader.findings.error("too_many_frames", FILE, message, "split the scan")
         frames = []
     common = {kind: _intrinsics(reader, scan.get(kind), kind) for kind in ("color_intrinsics", "depth_intrinsics")}
     reader.frames_found = len(frames)
@@ -171,6 +176,7 @@ def _mesh(reader: ScanReader, value: Any) -> MeshEntry | None:
     if value is None:
         return None  # the check reports it
     path = _path(reader, value, f"{FILE}: mesh")
+    reader.mesh_reported = path is None
     return MeshEntry(path) if path else None
 
 

@@ -39,7 +39,7 @@ def read(reader: ScanReader) -> ScanManifest | None:
     frames = _frames(reader.archive)
     reader.frames_found = len(frames)
     info = read_scene_info(reader)
-    color_size = info.color_size or reader.image_size([files["color"] for files in frames.values() if "color" in files])
+    color_size = info.color_size or reader.color_size([files["color"] for files in frames.values() if "color" in files])
     depth_size = reader.image_size([files["depth"] for files in frames.values() if "depth" in files])
     color = _camera(reader, COLOR_FILE, color_size)
     depth = _camera(reader, DEPTH_FILE, depth_size)

@@ -47,14 +47,14 @@ def read(reader: ScanReader) -> ScanManifest | None:
     colors = [frame.files["color"] for frame in frames.values() if "color" in frame.files]
     depths = [frame.files["depth"] for frame in frames.values() if "depth" in frame.files]
     info = _info(reader)
-    color_size, depth_size = reader.image_size([*colors]), reader.image_size([*depths])
+    color_size, depth_size = reader.color_size([*colors]), reader.image_size([*depths])
     color = _camera(reader, info, "Color", COLOR_FILES, color_size)
     depth = _camera(reader, info, "Depth", DEPTH_FILES, depth_size)
     if depth is None and color is not None and depth_size == (color.width, color.height):
         message = "there are no depth intrinsics; depth is taken to be registered to color"
         reader.findings.info("depth_as_color", "", message)
         depth = color
-    if color is None:
+    if color is None and color_size and not reader.findings.count("bad_intrinsics"):
         remedy = f"add {COLOR_FILES[0]} or {COMMON_FILE} with the 3x3 matrix"
         reader.findings.error("no_color_intrinsics", "", "there are no color intrinsics", remedy)
     depth_to_color = _depth_to_color(reader)

@@ -12,6 +12,7 @@ from advtex_scan.mesh._obj import read_obj
 from advtex_scan.mesh._ply import read_ply
 from advtex_scan.mesh._surface import MeshFacts, MeshSurface, broken, finish
 
+MAX_BYTES = 2 << 30
 READERS = {"ply": read_ply, "obj": read_obj, "glb": read_gltf, "gltf": read_gltf}
 
 __all__ = ["MeshFacts", "MeshSurface", "read_mesh"]
@@ -24,6 +25,9 @@ def read_mesh(archive: ScanArchive, path: str) -> MeshSurface:
     counts that disagree with the file's size, unsupported compression.
     """
     suffix = path.lower().rsplit(".", 1)[-1]
+    if archive.size(path) > MAX_BYTES:
+        message = f"is {archive.size(path)} bytes long; at most {MAX_BYTES} are accepted"
+        raise MeshError(broken(path, message, "decimate the mesh", "mesh_too_large"))
     if suffix in READERS:
         return finish(READERS[suffix](archive, path), path)
     raise MeshError(broken(path, "is of no known kind", "convert it to PLY, OBJ or GLB"))

@@ -22,9 +22,9 @@ from advtex_scan.manifest import IDENTITY, Matrix4
 from advtex_scan.matrices import compose, matrix4
 from advtex_scan.mesh._surface import RawMesh, broken, check_counts
 
-MAX_JSON = 64 << 20
+MAX_JSON = 16 << 20
 MAX_BUFFER = 1 << 30
-MAX_NODES = 100_000
+MAX_NODES = 100_000  # also of primitives drawn, repeated ones counted
 HEADER = struct.Struct("<4s2I")
 CHUNK = struct.Struct("<2I")
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
@@ -50,10 +50,14 @@ def read_gltf(archive: ScanArchive, path: str) -> RawMesh:
         file = _open_glb(archive, path) if path.lower().endswith(".glb") else _open_json(archive, path)
         _refuse_compression(file)
         mesh = RawMesh()
+        drawn = 0
         for node, transform in _nodes(file.document):
             index = node.get("mesh")
             if index is not None:
                 for primitive in _item(file.document, "meshes", index).get("primitives", []):
+                    drawn += 1
+                    if drawn > MAX_NODES:
+                        raise ValueError(f"more than {MAX_NODES} primitives")
                     _add_primitive(file, primitive, transform, mesh)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, struct.error) as error:
         # A file of this kind is a graph of indices; whatever does not resolve ends here.

@@ -62,6 +62,8 @@ def read_ply(archive: ScanArchive, path: str) -> RawMesh:
             raise MeshError(broken(path, "its header lists no vertices, or an element twice"))
         faces = by_name.get("face", _Element("face", 0))
         check_counts(path, by_name["vertex"].count, faces.count)
+        if any(element.count and not element.properties for element in elements):
+            raise MeshError(broken(path, "its header lists an element without properties"))
         least = sum(element.count * element.least_size(order == "") for element in elements)
         if least > archive.size(path):
             message = f"claims more vertices and faces than its {archive.size(path)} bytes can hold"

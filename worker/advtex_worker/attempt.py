@@ -155,21 +155,18 @@ class Attempt:
         base = self._persist(lambda: restore(self._store.blobs, self._job_id, self._number, self._space.work))
         self._log.info("attempt begins", resumed_files=len(base.files))
         uploader = CheckpointUploader(self._store.blobs, self._job_id, self._number, base, self._keeper.beat)
-        ended: FinishedEvent | FailedEvent | StoppedEvent | None = None
         try:
-            self._child = self._spawn(resume=bool(base.files))
-            ended = self._listen(self._child, uploader)
-            code = self._child.wait()
+            with self._spawn(resume=bool(base.files)) as child:
+                self._child = child
+                ended = self._listen(child, uploader)
         finally:
-            if self._child:
-                self._child.kill()
             if self._killer:
                 self._killer.cancel()
             if self._keeper.ending is Ending.lost:
                 uploader.abandon()
             else:
                 uploader.finish()
-        self._conclude(ended, code)
+        self._conclude(ended, child.returncode)
 
     def _spawn(self, resume: bool) -> Child:
         space = self._space

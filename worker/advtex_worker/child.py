@@ -10,7 +10,8 @@ import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import IO
+from types import TracebackType
+from typing import IO, Self
 
 from advtex_worker.events import STOP_LINE, Event, Request, parse_event
 
@@ -19,11 +20,16 @@ KEPT_OUT = ("ADVTEX_", "AWS_")  # the runner reads hostile files: it gets no pas
 
 
 class Child:
-    """A running runner. Made on a thread that lives as long as the child is wanted (`parentage.py`)."""
+    """A running runner, and a context manager that outlasts it.
+
+    Made on a thread that lives as long as the child is wanted (`parentage.py`).
+    returncode: of the process once the block has ended, negative for a signal.
+    """
 
     def __init__(self, request: Request, log: Path, threads: int) -> None:
         self._log = log
         self._lock = threading.Lock()
+        self.returncode = 0
         environment = {name: value for name, value in os.environ.items() if not name.startswith(KEPT_OUT)}
         for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
             environment[name] = str(threads)
@@ -59,11 +65,19 @@ class Child:
         with suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
 
-    def wait(self) -> int:
-        """The return code, negative for a signal. Leftover children are ended too."""
-        code = self._process.wait()
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        """Wait for its end, which an exception hurries; whatever it has started ends too. Sets `returncode`."""
+        if kind is not None:
+            self.kill()
+        self.returncode = self._process.wait()
         self.kill()
-        return code
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe:
+                with self._lock, suppress(BrokenPipeError):
+                    pipe.close()
 
     def log_tail(self) -> str:
         """The newest lines of what the runner and its libraries printed."""
@@ -75,7 +89,7 @@ class Child:
     def _write(self, line: str) -> None:
         pipe = self._process.stdin
         assert pipe is not None
-        with self._lock, suppress(BrokenPipeError):  # its death is noticed where its events are read
+        with self._lock, suppress(BrokenPipeError, ValueError):  # it is dead; that is noticed where events are read
             pipe.write(line.encode())
             pipe.flush()
 

@@ -1,0 +1,145 @@
+"""Engines with the interface of `advtex_engine.pipeline.texture_scan`, each with one way of its own to behave.
+
+They run in the runner's process, which finds them through PYTHONPATH.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+from advtex_engine.config import TextureConfig
+from advtex_engine.errors import OptionError, Problem, ScanError, Stopped
+from advtex_engine.monitor import Monitor
+
+RESULTS = ("model.obj", "model.mtl", "model.png", "model.glb", "report.json", "previews/side_by_side.png")
+
+
+def quick(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
+    """Does nothing much, and does it well."""
+    monitor.stage_started("ingest")
+    assert scan.stat().st_size > 0
+    monitor.warning(Problem("frame_dropped", "color/9.png", "has no pose", "give it one"))
+    monitor.stage_finished("ingest", 0.01, 1)
+    monitor.stage_started("optimization")
+    for step in range(1, 4):
+        monitor.progress(step, 3, {"l1": 1.0 / step, "adversarial": float("nan")})
+    monitor.stage_finished("optimization", 0.02, 1)
+    print("a stray line on stdout")  # must not be taken for an event
+    write_results(out, f"seed {config.seed} size {config.size}")
+
+
+def stepping(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
+    """`config.steps` steps of 20 ms, a checkpoint every 10; the result depends on every step, made once and in order.
+
+    The history in the state tells where each process began.
+    """
+    path = work / "state.json"
+    state = json.loads(path.read_text()) if resume and path.exists() else {"step": 0, "chain": "", "began": []}
+    state["began"].append(state["step"])
+    steps = config.steps or 100
+    monitor.stage_started("optimization")
+    while state["step"] < steps:
+        if monitor.stop_requested():
+            _save(path, state, monitor)
+            raise Stopped
+        time.sleep(0.02)
+        state["step"] += 1
+        state["chain"] = hashlib.sha256(f"{state['chain']} {state['step']}".encode()).hexdigest()
+        if state["step"] % 10 == 0:
+            _save(path, state, monitor)
+        monitor.progress(state["step"], steps, {"l1": 1.0 / state["step"]})
+    write_results(out, json.dumps(state))
+
+
+def chain(steps: int) -> str:
+    """What `stepping` must arrive at, however often it was interrupted."""
+    link = ""
+    for step in range(1, steps + 1):
+        link = hashlib.sha256(f"{link} {step}".encode()).hexdigest()
+    return link
+
+
+def crashes(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
+    """SIGSEGV in the middle of a stage."""
+    monitor.stage_started("ingest")
+    print("about to read address 0", file=sys.stderr, flush=True)
+    ctypes.string_at(0)
+
+
+def is_killed(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
+    """What the kernel does when memory runs out."""
+    monitor.stage_started("ingest")
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def crashes_once(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
+    """Dies in its first attempt, after a checkpoint."""
+    mark = work / "mark.txt"
+    if not resume:
+        monitor.stage_started("atlas")
+        mark.write_text("first attempt")
+        monitor.checkpointed((mark,))
+        os.kill(os.getpid(), signal.SIGKILL)
+    write_results(out, mark.read_text())
+
+
+def exits(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
+    """Leaves without a word."""
+    os._exit(7)
+
+
+def raises(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
+    raise ValueError("the widget is not a gadget")
+
+
+def out_of_memory(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
+    raise MemoryError("cannot allocate 90 GiB")
+
+
+def rejects(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
+    raise ScanError(
+        Problem("no_view", "color/", "no frame sees the mesh", "check the poses"),
+        Problem("bad_image", "color/1.png", "is no image", "export it again"),
+    )
+
+
+def refuses_options(
+    scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor
+) -> None:
+    raise OptionError("holdout 500 leaves no frame; choose less")
+
+
+def hangs(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
+    """Stuck inside native code: never comes back to ask."""
+    monitor.stage_started("atlas")
+    time.sleep(600)
+
+
+def ignores_stop(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
+    """Works on, whatever it is asked."""
+    monitor.stage_started("optimization")
+    for step in range(1, 30_000):
+        monitor.stop_requested()
+        monitor.progress(step, 30_000, {})
+        time.sleep(0.02)
+
+
+def write_results(out: Path, text: str) -> None:
+    for name in RESULTS:
+        path = out / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"{name}\n{text}\n")
+
+
+def _save(path: Path, state: dict[str, object], monitor: Monitor) -> None:
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(state))
+    part.replace(path)
+    monitor.checkpointed((path,))

@@ -1,0 +1,266 @@
+"""One attempt, carried in this process with a real runner process and named engines."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+
+import fake_engines
+import pytest
+
+from advtex_contract.jobs import JobState
+from advtex_store import keys
+from advtex_store.models import JobRow
+from advtex_store.store import Store
+from advtex_worker.settings import WorkerSettings
+from advtex_worker.tasks import Host, run_attempt
+
+Hosts = Callable[[str], Host]
+NewJob = Callable[..., str]
+
+
+def result(store: Store, job_id: str, name: str = "model.obj") -> str:
+    manifest = store.results.manifest(job_id)
+    (file,) = [file for file in manifest.files if file.name == name]
+    return store.blobs.get(file.key).decode()
+
+
+def wait_until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.02)
+
+
+def in_background(host: Host, job_id: str, attempt: int = 1) -> threading.Thread:
+    thread = threading.Thread(target=run_attempt, args=(host, job_id, attempt))
+    thread.start()
+    return thread
+
+
+def step_of(store: Store, job_id: str) -> int:
+    return int(store.records.job(job_id).progress["step"])
+
+
+def test_a_job_succeeds_with_results_warnings_and_progress(
+    store: Store, host: Hosts, new_job: NewJob, settings: WorkerSettings
+) -> None:
+    job_id = new_job(seed=7, width=320, height=240)
+    run_attempt(host("quick"), job_id, 1)
+    row = store.records.job(job_id)
+    assert row.state == JobState.succeeded
+    assert sorted(file["name"] for file in row.results) == sorted(fake_engines.RESULTS)
+    assert result(store, job_id) == "model.obj\nseed 7 size (320, 240)\n"
+    assert [warning["where"] for warning in row.warnings] == ["color/9.png"]
+    assert row.progress["step"] == row.progress["steps"] == 3
+    assert row.progress["losses"] == {"l1": pytest.approx(1 / 3)}
+    assert row.progress["stage_seconds"] == {"ingest": 0.01, "optimization": 0.02}
+    assert list(settings.workspaces.iterdir()) == []
+
+
+def test_an_attempt_that_is_not_waited_for_does_nothing(store: Store, host: Hosts, new_job: NewJob) -> None:
+    job_id = new_job()
+    run_attempt(host("raises"), job_id, 2)
+    run_attempt(host("raises"), "0" * 28, 1)
+    assert store.records.job(job_id).state == JobState.queued
+
+
+def test_a_finished_attempt_is_adopted_instead_of_repeated(store: Store, host: Hosts, new_job: NewJob) -> None:
+    job_id = new_job()
+    run_attempt(host("quick"), job_id, 1)
+    manifest = store.blobs.get(keys.result_manifest_key(job_id))
+    _edit(store, job_id, state="queued", attempt=2, results=[])
+    run_attempt(host("raises"), job_id, 2)
+    assert store.records.job(job_id).state == JobState.succeeded
+    assert store.blobs.get(keys.result_manifest_key(job_id)) == manifest
+
+
+@pytest.mark.parametrize(
+    ("engine", "code", "words"),
+    [
+        ("raises", "engine_error", "ValueError: the widget is not a gadget"),
+        ("refuses", "invalid_options", "holdout 500 leaves no frame"),
+        ("out_of_memory", "out_of_memory", "max-texture-size"),
+        ("no_such_engine", "engine_error", "no_such_engine"),
+    ],
+)
+def test_an_error_that_would_come_again_fails_the_job(
+    store: Store, host: Hosts, new_job: NewJob, engine: str, code: str, words: str
+) -> None:
+    job_id = new_job()
+    run_attempt(host(engine), job_id, 1)
+    row = store.records.job(job_id)
+    assert row.state == JobState.failed
+    assert row.error is not None
+    assert row.error["code"] == code
+    assert words in row.error["message"]
+    assert ("Traceback" in row.error["log_tail"]) == (code != "invalid_options")
+
+
+def test_half_a_size_is_refused_as_an_option(store: Store, host: Hosts, new_job: NewJob) -> None:
+    job_id = new_job(width=320)
+    run_attempt(host("quick"), job_id, 1)
+    error = store.records.job(job_id).error
+    assert error is not None
+    assert error["code"] == "invalid_options"
+    assert "width and height" in error["message"]
+
+
+def test_a_bad_scan_is_rejected_with_every_problem(store: Store, host: Hosts, new_job: NewJob) -> None:
+    job_id = new_job()
+    run_attempt(host("rejects"), job_id, 1)
+    row = store.records.job(job_id)
+    assert row.state == JobState.rejected
+    assert row.error is not None
+    assert [detail["where"] for detail in row.error["details"]] == ["color/", "color/1.png"]
+    assert all(detail["remedy"] for detail in row.error["details"])
+
+
+def test_a_scan_that_is_gone_fails_the_job(store: Store, host: Hosts, new_job: NewJob) -> None:
+    job_id = new_job()
+    store.blobs.delete(keys.scan_key(store.records.job(job_id).upload_id))
+    run_attempt(host("quick"), job_id, 1)
+    error = store.records.job(job_id).error
+    assert error is not None
+    assert error["code"] == "scan_missing"
+
+
+@pytest.mark.parametrize(
+    ("engine", "sentence"),
+    [
+        ("crashes", "crashed in native code: SIGSEGV"),
+        ("is_killed", "was killed (out of memory?): SIGKILL"),
+        ("exits", "ended without a result (exit code 7)"),
+    ],
+)
+def test_three_deaths_without_progress_are_poison(
+    store: Store, host: Hosts, new_job: NewJob, engine: str, sentence: str
+) -> None:
+    job_id = new_job()
+    for attempt in (1, 2, 3):
+        row = store.records.job(job_id)
+        assert (row.state, row.attempt) == (JobState.queued, attempt)
+        run_attempt(host(engine), job_id, attempt)
+    row = store.records.job(job_id)
+    assert row.state == JobState.failed
+    assert row.error is not None
+    assert row.error["code"] == "poison"
+    assert sentence in row.error["log_tail"]
+    assert ("about to read address 0" in row.error["log_tail"]) == (engine == "crashes")
+
+
+def test_the_attempt_after_a_death_goes_on_from_the_checkpoint(store: Store, host: Hosts, new_job: NewJob) -> None:
+    job_id = new_job()
+    run_attempt(host("crashes_once"), job_id, 1)
+    assert store.records.job(job_id).state == JobState.queued
+    run_attempt(host("crashes_once"), job_id, 2)
+    assert store.records.job(job_id).state == JobState.succeeded
+    assert result(store, job_id) == "model.obj\nfirst attempt\n"
+
+
+def test_cancel_stops_within_two_seconds_and_retry_goes_on(store: Store, host: Hosts, new_job: NewJob) -> None:
+    job_id = new_job(steps=150)
+    thread = in_background(host("stepping"), job_id)
+    wait_until(lambda: step_of(store, job_id) >= 15)
+    asked = time.monotonic()
+    store.records.cancel(job_id)
+    thread.join()
+    assert time.monotonic() - asked < 2.0
+    assert store.records.job(job_id).state == JobState.canceled
+    reached = step_of(store, job_id)
+    store.records.retry(job_id)
+    run_attempt(host("stepping"), job_id, 2)
+    state = json.loads(result(store, job_id).split("\n", 1)[1])
+    assert state["chain"] == fake_engines.chain(150)
+    assert state["began"][0] == 0
+    assert reached <= state["began"][1] < 150, "the checkpoint of the stop itself was not used"
+    assert list(store.blobs.list(keys.checkpoints_prefix(job_id))) == [], "checkpoints outlived the results"
+
+
+def test_sigterm_preempts_without_counting_as_a_death(store: Store, host: Hosts, new_job: NewJob) -> None:
+    job_id = new_job(steps=100)
+    for attempt in (1, 2, 3, 4):
+        given = host("stepping")
+        thread = in_background(given, job_id, attempt)
+        wait_until(lambda: store.records.job(job_id).state == JobState.running)
+        given.stop_signal._on_signal(signal.SIGTERM, None)
+        thread.join()
+        row = store.records.job(job_id)
+        assert (row.state, row.attempt, row.deaths) == (JobState.preempted, attempt + 1, 0)
+    run_attempt(host("stepping"), job_id, 5)
+    state = json.loads(result(store, job_id).split("\n", 1)[1])
+    assert state["chain"] == fake_engines.chain(100)
+    assert state["began"] == sorted(state["began"])
+
+
+@pytest.mark.parametrize("engine", ["hangs", "ignores_stop"])
+def test_a_runner_that_does_not_stop_is_killed_after_the_grace(
+    store: Store, host: Hosts, new_job: NewJob, engine: str
+) -> None:
+    job_id = new_job()
+    thread = in_background(host(engine), job_id)
+    wait_until(lambda: store.records.job(job_id).progress["stage"] != "")
+    asked = time.monotonic()
+    store.records.cancel(job_id)
+    thread.join()
+    assert 1.0 <= time.monotonic() - asked < 4.0
+    assert store.records.job(job_id).state == JobState.canceled
+
+
+def test_a_lost_lease_ends_the_runner_and_commits_nothing(store: Store, host: Hosts, new_job: NewJob) -> None:
+    job_id = new_job(steps=500)
+    thread = in_background(host("stepping"), job_id)
+    wait_until(lambda: step_of(store, job_id) >= 12)
+    wait_until(lambda: store.blobs.exists(keys.checkpoint_prefix(job_id, 1) + "index.json"))
+    store.records.lost(job_id, 1)  # as the server's reconciler does when it takes this worker for dead
+    thread.join(timeout=5.0)
+    assert not thread.is_alive()
+    row = store.records.job(job_id)
+    assert (row.state, row.attempt) == (JobState.queued, 2)
+    assert not store.blobs.exists(keys.result_manifest_key(job_id))
+    before = {blob.key: blob.etag for blob in store.blobs.list(keys.checkpoints_prefix(job_id))}
+    time.sleep(0.3)
+    assert {blob.key: blob.etag for blob in store.blobs.list(keys.checkpoints_prefix(job_id))} == before
+
+
+def test_leftovers_of_killed_attempts_are_swept_and_live_ones_kept(
+    store: Store, host: Hosts, new_job: NewJob, settings: WorkerSettings
+) -> None:
+    leftover = settings.workspaces / "dead-1"
+    (leftover / "work").mkdir(parents=True)
+    running = new_job(steps=100)
+    thread = in_background(host("stepping"), running)
+    wait_until(lambda: step_of(store, running) >= 1)
+    assert not leftover.exists()
+    run_attempt(host("quick"), new_job(), 1)
+    thread.join()
+    assert store.records.job(running).state == JobState.succeeded
+
+
+def test_the_runner_dies_with_its_parent(store: Store, settings: WorkerSettings, new_job: NewJob) -> None:
+    job_id = new_job()
+    parent = os.fork()
+    if parent == 0:
+        run_attempt(Host(settings, engine="fake_engines:hangs"), job_id, 1)
+        os._exit(0)
+    wait_until(lambda: store.records.job(job_id).progress["stage"] == "atlas")
+    (runner,) = _children(parent)
+    os.kill(parent, signal.SIGKILL)
+    os.waitpid(parent, 0)
+    wait_until(lambda: not os.path.exists(f"/proc/{runner}"), seconds=3.0)  # noqa: PTH110
+
+
+def _children(pid: int) -> list[int]:
+    with open(f"/proc/{pid}/task/{pid}/children") as file:  # noqa: PTH123
+        return [int(child) for child in file.read().split()]
+
+
+def _edit(store: Store, job_id: str, **values: object) -> None:
+    with store.database.write() as session:
+        row = session.get_one(JobRow, job_id)
+        for name, value in values.items():
+            setattr(row, name, value)

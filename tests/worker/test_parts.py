@@ -1,0 +1,231 @@
+"""The small parts of the worker, each against what it promises to its neighbours."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from advtex_contract.jobs import Progress
+from advtex_contract.options import JobOptions, Preset
+from advtex_engine import config as engine
+from advtex_engine.errors import OptionError
+from advtex_engine.monitor import STAGES
+from advtex_store.errors import StaleAttempt
+from advtex_store.queue import TASK
+from advtex_store.records import Lease
+from advtex_worker.adapt import texture_config
+from advtex_worker.child import death_sentence
+from advtex_worker.events import (
+    CheckpointEvent,
+    Event,
+    FailedEvent,
+    FinishedEvent,
+    ProgressEvent,
+    StageEvent,
+    StoppedEvent,
+    parse_event,
+)
+from advtex_worker.lease import Ending, LeaseKeeper
+from advtex_worker.progress import ProgressTracker
+
+
+def test_the_task_that_the_queue_names_exists() -> None:
+    module, _, name = TASK.rpartition(".")
+    assert callable(getattr(importlib.import_module(module), name))
+
+
+def test_the_engine_that_the_runner_names_exists() -> None:
+    runner = importlib.import_module("advtex_worker.runner")
+    assert callable(runner._resolved(runner.ENGINE))
+
+
+def test_neither_worker_nor_work_horse_imports_torch() -> None:
+    code = "import advtex_worker.main, sys; sys.exit('torch' in sys.modules or 'cv2' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_presets_of_users_and_engine_are_the_same() -> None:
+    assert {preset.value for preset in Preset} == {"auto", *engine.PRESETS}
+
+
+BOUNDS = {"width": 64, "height": 64, "steps": 1, "face_budget": 100, "max_texture_size": 256, "holdout": 2}
+
+
+@pytest.mark.parametrize("name", sorted(BOUNDS))
+def test_the_engine_takes_what_the_contract_takes_at_its_bounds(name: str) -> None:
+    both = {"width": 100, "height": 100} if name in ("width", "height") else {}
+    for bound in JobOptions.model_fields[name].metadata:
+        value = getattr(bound, "ge", None) or getattr(bound, "le", None)
+        texture_config(JobOptions.model_validate(both | {name: value}), "cpu")
+
+
+@given(
+    st.sampled_from(Preset),
+    st.integers(64, 4096),
+    st.integers(64, 4096),
+    st.integers(2, 1000),
+    st.integers(0, 2**31 - 1),
+    st.none() | st.integers(100, 2_000_000),
+)
+def test_every_option_arrives(
+    preset: Preset, width: int, height: int, holdout: int, seed: int, face_budget: int | None
+) -> None:
+    options = JobOptions(
+        preset=preset, width=width, height=height, holdout=holdout, seed=seed, face_budget=face_budget, steps=9
+    )
+    config = texture_config(options, "cuda:1")
+    assert (config.preset, config.size, config.holdout, config.seed) == (preset.value, (width, height), holdout, seed)
+    assert (config.steps, config.device, config.max_texture_size) == (9, "cuda:1", options.max_texture_size)
+    assert config.face_budget == (engine.TextureConfig().face_budget if face_budget is None else face_budget)
+
+
+def test_half_a_size_is_an_option_error() -> None:
+    with pytest.raises(OptionError, match="width and height"):
+        texture_config(JobOptions(height=100), "cpu")
+
+
+@pytest.mark.parametrize(
+    "event",
+    [
+        StageEvent(stage="atlas"),
+        StageEvent(stage="atlas", seconds=1.5),
+        ProgressEvent(step=1, steps=2, losses={"l1": 0.5}),
+        CheckpointEvent(files={"a/b": Path("/x/1")}),
+        FinishedEvent(),
+        StoppedEvent(),
+        FailedEvent(code="engine_error", message="two\nlines"),
+    ],
+)
+def test_events_survive_the_line(event: Event) -> None:
+    assert event.line().count("\n") == 1
+    assert parse_event(event.line()) == event
+
+
+@pytest.mark.parametrize("line", ["", "{}", '{"kind": "dance"}', '{"kind": "stage"}', "Epoch 1: loss 0.5"])
+def test_other_lines_are_no_events(line: str) -> None:
+    with pytest.raises(ValueError, match="validation error"):
+        parse_event(line)
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [(-9, "out of memory"), (-11, "SIGSEGV"), (-15, "SIGTERM"), (3, "exit code 3"), (-50, "signal 50"), (0, "without")],
+)
+def test_a_death_is_a_sentence(code: int, words: str) -> None:
+    assert words in death_sentence(code)
+
+
+class Clock:
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_the_eta_counts_only_steps_of_this_attempt() -> None:
+    clock = Clock()
+    tracker = ProgressTracker(clock)
+    tracker.stage(StageEvent(stage="optimization"))
+    tracker.progress(ProgressEvent(step=3000, steps=4000))  # resumed
+    assert tracker.view.eta_seconds is None
+    clock.now += 10.0
+    tracker.progress(ProgressEvent(step=3100, steps=4000))
+    assert tracker.view.eta_seconds == pytest.approx(90.0)
+    tracker.stage(StageEvent(stage="export"))
+    assert tracker.view.eta_seconds is None
+
+
+@given(st.lists(st.tuples(st.sampled_from(STAGES), st.integers(0, 1_000_000)), max_size=20))
+def test_reached_grows_with_stage_and_step_and_never_shrinks(moves: list[tuple[str, int]]) -> None:
+    tracker = ProgressTracker()
+    best = (0, 0)
+    for stage, step in moves:
+        before = tracker.reached
+        tracker.stage(StageEvent(stage=stage))
+        tracker.progress(ProgressEvent(step=step, steps=1_000_000))
+        grew = (STAGES.index(stage), step) > best
+        best = max(best, (STAGES.index(stage), step))
+        assert (tracker.reached > before) == grew
+
+
+class FakeRecords:
+    """Answers heartbeats as it is told."""
+
+    lease_seconds = 0.2
+
+    def __init__(self) -> None:
+        self.answer: Lease | Exception = Lease(math.inf, False)
+        self.heard: list[tuple[Any, int, str | None]] = []
+
+    def heartbeat(
+        self, job_id: str, attempt: int, progress: Progress | None = None, *, reached: int, log_tail: str | None
+    ) -> Lease:
+        self.heard.append((progress, reached, log_tail))
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer
+
+
+def keeper(records: FakeRecords, endings: list[Ending], tail: str = "") -> LeaseKeeper:
+    return LeaseKeeper(records, "job", 1, interval=60.0, on_ending=endings.append, log_tail=lambda: tail)  # type: ignore[arg-type]
+
+
+def test_a_database_that_is_away_costs_nothing_until_the_lease_has_run_out() -> None:
+    records, endings = FakeRecords(), []
+    kept = keeper(records, endings)
+    assert kept.beat()
+    records.answer = ConnectionError("no route")
+    assert kept.beat()
+    assert endings == []
+    time.sleep(0.25)
+    assert not kept.beat()
+    assert endings == [Ending.lost]
+
+
+def test_a_stale_attempt_is_told_once_and_overrules_a_cancel() -> None:
+    records, endings = FakeRecords(), []
+    kept = keeper(records, endings)
+    records.answer = Lease(math.inf, True)
+    kept.beat()
+    kept.beat()
+    records.answer = StaleAttempt("moved on")
+    kept.beat()
+    kept.beat()
+    kept.end(Ending.preempt)
+    assert endings == [Ending.cancel, Ending.lost]
+    assert kept.ending is Ending.lost
+
+
+def test_progress_and_a_changed_log_travel_with_the_heartbeat() -> None:
+    records = FakeRecords()
+    kept = keeper(records, [], tail="line 1")
+    kept.report(Progress(stage="atlas"), 7)
+    kept.beat()
+    kept.beat()
+    assert records.heard == [(Progress(stage="atlas"), 7, "line 1"), (Progress(stage="atlas"), 7, None)]
+
+
+def test_a_device_lock_is_exclusive_and_free_again(tmp_path: Path) -> None:
+    devices = importlib.import_module("advtex_worker.devices")
+    path = tmp_path / "gpu.lock"
+    held = devices.try_lock(path)
+    assert held is not None
+    assert devices.try_lock(path) is None
+    held.close()
+    again = devices.try_lock(path)
+    assert again is not None
+    again.close()
+
+
+def test_the_cpu_needs_no_lock() -> None:
+    devices = importlib.import_module("advtex_worker.devices")
+    assert devices.acquire("cpu", lambda: True) == ("cpu", None)

@@ -111,7 +111,8 @@ def _write_obj(path: Path, mesh: Mesh, normals: Tensor, mtl: str) -> None:
             ("vn %.4f %.4f %.4f\n", normals.double()),
             ("f %d/%d/%d %d/%d/%d %d/%d/%d\n", faces),
         ):
-            for block in rows.split(LINES_PER_BLOCK):
+            for first in range(0, len(rows), LINES_PER_BLOCK):
+                block = rows[first : first + LINES_PER_BLOCK]
                 file.write((line * len(block) % tuple(block.flatten().tolist())).encode())
 
 

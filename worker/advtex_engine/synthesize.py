@@ -41,14 +41,14 @@ from advtex_engine.rasterize import rasterize
 from advtex_engine.scene import Atlas, Camera, Mesh
 
 CAMERA_ERROR = 0.003
-"""e_t in metres. At half a metre this shifts the image by up to 2 pixels of a 320x240 frame per axis, and the turn that
-goes with it as much again: two frames disagree by 2 to 6 pixels, as those of real scans do (3 to 20 mm at 2 to 3 m)."""
+"""e_t in metres. At DISTANCE it shifts a 320x240 frame by up to 2.5 pixels per axis, and the turn that goes with it as
+much again: two frames disagree by a few pixels, as those of real scans do (3 to 20 mm at 2 to 3 m)."""
 GEOMETRY_ERROR = 0.006
 """e_g in metres: 2 % of the object's 0.3 m, the least of the paper's. Smoothing leaves about 1 mm."""
 LAPLACIAN_STEPS = 3
 TARGET = (0.0, 0.0, 0.085)
 """Where the cameras look, metres."""
-DISTANCE = 0.5
+DISTANCE = 0.4
 """Mean distance of the cameras, metres."""
 RINGS = ((14.0, 0.40), (34.0, 0.35), (58.0, 0.25))
 """Elevation in degrees and share of the views of each ring."""

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 Surface = Callable[[Array], Array]
 
 TEXTURE_SIZE = 2048
-DENSITY = 3.05
+DENSITY = 3.1
 """Texels per millimetre: the drawings fill the atlas."""
 SPACING = 4.5
 """Millimetres between vertices: fine enough for the paper's per-vertex offsets to bend every surface."""
@@ -71,10 +71,10 @@ def _patches(rng: np.random.Generator) -> Iterator[Patch]:
     yield from _tin(rng)
     yield from _mug(rng)
     yield from _book(rng)
-    block = _rounded_rectangle(36, 36, 3.0)
-    place = _placed(-20, -56, 49, 28)
-    yield _swept(block, [(0, 36), (0, 0), (0, -1)], place, partial(prints.letter_block, rng=rng))
-    yield _cap(block, 36, place, partial(prints.block_top, rng=rng))
+    block = _rounded_rectangle(32, 32, 2.5)
+    place = _placed(-9, -84, 49, 28)
+    yield _swept(block, [(0, 32), (0, 0), (0, -1)], place, partial(prints.letter_block, rng=rng))
+    yield _cap(block, 32, place, partial(prints.block_top, rng=rng))
 
 
 def _turntable(rng: np.random.Generator) -> Iterator[Patch]:
@@ -100,10 +100,10 @@ def _tin(rng: np.random.Generator) -> Iterator[Patch]:
     for turn in (0.0, 180.0):
         boss = _ellipse(7, 7)
         side = _compose(place, _turned(90 + turn))
-        yield _cap(boss, 65.0, _compose(side, _tipped(0, 0, 112)), partial(prints.glaze, rng=rng, color=prints.GOLD))
+        yield _cap(boss, 65.0, _compose(side, _tipped(0, 0, 112)), partial(prints.brass, rng=rng))
         rod = [(0, 65), (0, 54)]
         stand = _compose(side, _tipped(0, 0, 112))
-        yield _swept(boss, rod, stand, partial(prints.glaze, rng=rng, color=prints.GOLD))
+        yield _swept(boss, rod, stand, partial(prints.brass, rng=rng))
 
 
 def _mug(rng: np.random.Generator) -> Iterator[Patch]:
@@ -113,8 +113,8 @@ def _mug(rng: np.random.Generator) -> Iterator[Patch]:
     yield _swept(wall, outside, place, partial(prints.mug_side, rng=rng))
     yield _swept(wall[::-1], [(1.6, 88), (3.6, 86.5), (4, 60)], place, partial(prints.glaze, rng=rng))
     yield _cap(_ellipse(33.2, 33.2), 66, place, partial(prints.tea, rng=rng))
-    angle = np.linspace(1.62, -1.62, 91)
-    handle = np.stack([29 + 32 * np.cos(angle), 0 * angle, 46 + 27 * np.sin(angle)], -1)
+    angle = np.linspace(1.5, -1.5, 91)
+    handle = np.stack([33 + 30 * np.cos(angle), 0 * angle, 46 + 27 * np.sin(angle)], -1)
     yield _tube(handle, 5.2, _compose(place, _turned(-48)), partial(prints.glaze, rng=rng, color=prints.BLUE))
 
 
@@ -154,15 +154,15 @@ def _ellipse(a: float, b: float) -> Array:
 
 
 def _rounded_rectangle(width: float, height: float, radius: float) -> Array:
-    """Closed counter-clockwise outline [N,2] from the middle of the left side."""
+    """Closed counter-clockwise outline [N,2] from the corner at -x, -y: the wall at -y comes first."""
     turns = [(-1, -1, np.pi), (1, -1, 1.5 * np.pi), (1, 1, 0.0), (-1, 1, 0.5 * np.pi)]
-    points = [np.array([[-width / 2, 0.0]])]
+    points = []
     for x, y, start in turns:
         angle = start + np.linspace(0, np.pi / 2, 19)
         center = np.array([x * (width / 2 - radius), y * (height / 2 - radius)])
         points.append(center + radius * np.stack([np.cos(angle), np.sin(angle)], -1))
-    points.append(points[0])
-    return np.concatenate(points)
+    ring = np.concatenate(points)
+    return np.concatenate([ring[9:], ring[:10]])
 
 
 def _outward(outline: Array) -> Array:
@@ -275,16 +275,17 @@ def _compose(outer: Surface, inner: Surface) -> Surface:
 
 
 def _pack(shapes: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Top left texel (row, column) of each chart: shelves, highest first."""
+    """Top left texel (row, column) of each chart: highest first, each as high up as the charts above it let it."""
     corners: dict[int, tuple[int, int]] = {}
-    row, column, shelf = GAP, GAP, 0
+    filled = np.full(TEXTURE_SIZE - GAP, GAP)
     for index in sorted(range(len(shapes)), key=lambda i: -shapes[i][0]):
         height, width = shapes[index]
-        if column + width + GAP > TEXTURE_SIZE:
-            row, column, shelf = row + shelf + GAP, GAP, 0
+        rows = np.lib.stride_tricks.sliding_window_view(filled[GAP:], width + GAP).max(1)
+        column = GAP + int(rows.argmin())
+        row = int(rows.min())
+        assert row + height + GAP <= TEXTURE_SIZE, "the charts do not fit; lower DENSITY"
+        filled[column : column + width + GAP] = row + height + GAP
         corners[index] = (row, column)
-        column, shelf = column + width + GAP, max(shelf, height)
-    assert row + shelf + GAP <= TEXTURE_SIZE, f"the charts need {row + shelf + GAP} rows; lower DENSITY"
     return [corners[index] for index in range(len(shapes))]
 
 

@@ -26,12 +26,7 @@ SKY: Rgb = (128, 172, 206)
 OVERSAMPLE = 2
 SUBPIXEL_BITS = 4
 
-SMALL_PRINT = (
-    "Second flush, picked by hand in May",
-    "above 1,900 m, rolled, fired and sorted",
-    "within one day. 3 g to a cup, water at",
-    "90 degrees, three minutes, no longer.",
-)
+SMALL_PRINT = ("Second flush, picked in May", "above 1,900 m. 3 g to a cup,", "water at 90 C, 3 minutes.")
 
 
 class Sheet:
@@ -114,9 +109,10 @@ def circle(x: float, y: float, radius: float, count: int = 180) -> NDArray[np.fl
 def rosette(sheet: Sheet, x: float, y: float, radius: float, color: Rgb, petals: int, pen: float) -> None:
     """Engine-turned ornament: three families of interlaced waves around a circle, as on banknotes."""
     angle = np.linspace(0, 2 * np.pi, 720)
+    strands = int(np.clip(radius / 5, 2, 5))
     curves = []
     for inner, outer in ((0.18, 0.52), (0.48, 0.8), (0.76, 1.0)):
-        for phase in np.linspace(0, 2 * np.pi, 6, endpoint=False):
+        for phase in np.linspace(0, 2 * np.pi, strands, endpoint=False):
             wave = 0.5 + 0.5 * np.sin(petals * angle + phase)
             r = radius * (inner + (outer - inner) * wave)
             curves.append(np.stack([x + r * np.cos(angle), y + r * np.sin(angle)], -1))
@@ -163,16 +159,16 @@ def label(sheet: Sheet, x: float, y: float, title: str, number: str) -> None:
     for dx in (9, 67):
         for dy in (9, 99):
             rosette(sheet, left + dx, top + dy, 4.2, RED, 5, 0.2)
-    sheet.text("H. ALDER & SONS", x, top + 9, 4.0, INK)
+    sheet.text("ALDER & SONS", x, top + 9, 5.2, INK)
     rosette(sheet, x, top + 31, 14.5, BLUE, 9, 0.25)
     sheet.disc(x, top + 31, 7.2, CREAM)
     sheet.text(number, x, top + 31, 6.6, RED, bold=True)
     sheet.text(title, x, top + 54, 8.2, INK, bold=True)
-    sheet.text("FINE LEAF TEA", x, top + 64.5, 4.6, RED)
-    hatching(sheet, left + 8, top + 69, 60, 3.2, INK)
+    sheet.text("FINE LEAF TEA", x, top + 64.5, 5.8, RED)
+    hatching(sheet, left + 8, top + 70.5, 60, 3.6, INK)
     for line, words in enumerate(SMALL_PRINT):
-        sheet.text(words, x, top + 77 + 4.7 * line, 2.3, INK)
-    sheet.text("NET 250 g", x, top + 99, 3.6, INK, bold=True)
+        sheet.text(words, x, top + 79 + 5.2 * line, 3.1, INK)
+    sheet.text("NET 250 g", x, top + 98, 4.6, INK, bold=True)
 
 
 def tin_side(width: float, height: float, density: float, rng: np.random.Generator) -> Image:
@@ -229,7 +225,7 @@ def mug_side(width: float, height: float, density: float, rng: np.random.Generat
     ):
         sheet.text(first, float(x), height * 0.42, 8.0, BLUE, bold=True)
         sheet.text(second, float(x), height * 0.56, 8.0, RED, bold=True)
-        sheet.text("stoneware, glazed and fired twice", float(x), height * 0.67, 2.6, INK)
+        sheet.text("stoneware, glazed and fired twice", float(x), height * 0.67, 2.9, INK)
     for x in np.array([0, 2, 4]) * width / 6:
         for side in (float(x), float(x) + width if x == 0 else float(x)):
             rosette(sheet, side, height * 0.49, 8.0, SKY, 7, 0.35)
@@ -239,8 +235,15 @@ def mug_side(width: float, height: float, density: float, rng: np.random.Generat
 def glaze(width: float, height: float, density: float, rng: np.random.Generator, color: Rgb = CREAM) -> Image:
     """Plain glazed ware with faint streaks and a rim line at the top."""
     sheet = Sheet(width, height, density, color)
-    sheet.grain(rng, 0.03, (4, 10))
-    sheet.box(0, 0, width, min(2.5, height / 6), BLUE)
+    sheet.grain(rng, 0.012, (8, 20))
+    sheet.box(0, 0, width, 2.5, BLUE)
+    return sheet.done()
+
+
+def brass(width: float, height: float, density: float, rng: np.random.Generator) -> Image:
+    """A plain fitting."""
+    sheet = Sheet(width, height, density, GOLD)
+    sheet.grain(rng, 0.04, (1, 4))
     return sheet.done()
 
 
@@ -249,7 +252,7 @@ def tea(width: float, height: float, density: float, rng: np.random.Generator) -
     sheet = Sheet(width, height, density, (122, 62, 22))
     for share, color in ((0.99, (176, 104, 44)), (0.9, (142, 76, 28)), (0.8, (122, 62, 22)), (0.5, (112, 54, 20))):
         sheet.disc(width / 2, height / 2, width / 2 * share, color)
-    sheet.grain(rng, 0.05, (6, 6))
+    sheet.grain(rng, 0.015, (6, 6))
     return sheet.done()
 
 
@@ -290,7 +293,7 @@ def turntable_top(width: float, height: float, density: float, rng: np.random.Ge
         ends = np.array([[np.cos(angle), -np.sin(angle)]]) * radius * np.array([[inner], [0.955]]) + [x, y]
         sheet.lines([ends], INK, 0.4 if degree % 10 else 0.8)
     for degree in range(0, 360, 15):
-        _radial_text(sheet, str(degree), radius, radius * 0.872, degree)
+        _radial_text(sheet, str(degree), radius, radius * 0.873, degree)
     for share in (0.82, 0.8):
         sheet.disc(x, y, radius * share, RED, 0.5)
     return sheet.done()
@@ -298,8 +301,8 @@ def turntable_top(width: float, height: float, density: float, rng: np.random.Ge
 
 def _radial_text(sheet: Sheet, words: str, center: float, radius: float, degree: float) -> None:
     """Write `words` on a dial so that they read upright from outside at `degree` (counter-clockwise from +x)."""
-    tile = Sheet(14, 6, sheet.scale / OVERSAMPLE, CREAM)
-    tile.text(words, 7, 3, 3.2, INK, bold=True)
+    tile = Sheet(16, 7, sheet.scale / OVERSAMPLE, CREAM)
+    tile.text(words, 8, 3.5, 4.6, INK, bold=True)
     size = (tile.pixels.shape[1], tile.pixels.shape[0])
     angle = np.radians(degree)
     x = (center + radius * np.cos(angle)) * sheet.scale

@@ -20,7 +20,6 @@ from collections.abc import Iterable, Iterator
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from advtex_engine.scene import Camera, Fragments, Mesh
 
@@ -46,8 +45,9 @@ _Point = tuple[Tensor, Tensor, Tensor]  # (column u, row v, 1) times z; or the c
 def rasterize(mesh: Mesh, camera: Camera, *, near: float = NEAR, max_bytes: int = MAX_BYTES) -> Fragments:
     """What `camera` sees of `mesh` at its pixel centres, on the device of the mesh.
 
-    near: metres; nothing nearer along z is seen. max_bytes: bound on temporary memory, apart from a few words per
-    vertex, face and pixel. Not differentiable. Faces without area or with corners that are not finite are not seen.
+    near: metres; nothing nearer along z is seen. max_bytes: bound on temporary memory, apart from about 50 bytes
+    per vertex and face, 100 per visible face and 30 per pixel. Not differentiable. Faces without area or with corners
+    that are not finite are not seen.
     """
     return next(rasterize_views(mesh, [camera], near=near, max_bytes=max_bytes))
 
@@ -67,7 +67,7 @@ def rasterize_views(
     for camera in cameras:
         points, beyond = _image_points(positions, camera, near, block)
         seen = _in_frustum(beyond, corners, block)
-        nearest = torch.full((camera.height * camera.width,), _EMPTY, dtype=torch.int64, device=positions.device)
+        nearest = _full(camera.height * camera.width, _EMPTY, torch.int64, positions.device, block)
         for part in _blocks(len(seen), block):
             _draw_faces(nearest, points, corners, seen[part], camera, near, block)
         yield _resolve(nearest, points, corners, camera, block)
@@ -222,6 +222,13 @@ def _expand(count: Tensor, first: Tensor | None) -> tuple[Tensor, Tensor]:
     return item, torch.arange(total, device=count.device).add_(before.index_select(0, item))
 
 
+def _full(size: int, value: int, dtype: torch.dtype, device: torch.device, block: int) -> Tensor:
+    filled = torch.empty(size, dtype=dtype, device=device)
+    for part in _blocks(size, block):
+        filled[part].fill_(value)
+    return filled
+
+
 def _blocks(total: int, size: int) -> Iterator[slice]:
     return (slice(start, min(start + size, total)) for start in range(0, total, size))
 
@@ -241,7 +248,7 @@ def _resolve(nearest: Tensor, points: Tensor, corners: Tensor, camera: Camera, b
     """Keys [H * W] -> `Fragments`; depth and barycentrics of the pixels' faces are computed afresh from float64."""
     height, width, device = camera.height, camera.width, nearest.device
     none = corners.shape[1]
-    visible = torch.zeros(none + 1, dtype=torch.bool, device=device)
+    visible = _full(none + 1, False, torch.bool, device, block)
     visible[none] = True
     for part in _blocks(len(nearest), block):
         visible.index_fill_(0, nearest[part].bitwise_and_(_FACE_MASK).clamp_(max=none), True)
@@ -250,27 +257,36 @@ def _resolve(nearest: Tensor, points: Tensor, corners: Tensor, camera: Camera, b
     place.index_copy_(0, index, torch.arange(len(index), device=device))
     names = index.int()
     names[-1] = -1
-    edges, inverse_depth, _ = _planes(_face_points(points, corners, index[:-1]))
-    # The last row is for pixels that see nothing: infinitely far, so depth and all weights / z come out as 0.
-    tables = [pad(table, (0, 1)) for table in (*edges[0], *edges[1], *edges[2], *inverse_depth)]
-    tables[-1][-1] = torch.inf
+    # The last column is for pixels that see nothing: infinitely far, so depth and all weights / z come out as 0.
+    tables = torch.zeros((12, len(index)), dtype=torch.float64, device=device)
+    tables[-1, -1] = torch.inf
+    for part in _blocks(len(index) - 1, block):
+        edges, inverse_depth, _ = _planes(_face_points(points, corners, index[part]))
+        for table, values in zip(tables, (*edges[0], *edges[1], *edges[2], *inverse_depth), strict=True):
+            table[part] = values
 
-    face_index = torch.empty((height, width), dtype=torch.int32, device=device)
-    barycentric = torch.empty((height, width, 3), device=device)
-    depth = torch.empty((height, width), device=device)
-    u = torch.arange(width, dtype=torch.float64, device=device)
-    v = torch.arange(height, dtype=torch.float64, device=device)[:, None]
-    for rows in _blocks(height, max(1, block // width)):
-        which = place.index_select(0, nearest[rows.start * width : rows.stop * width])
-        face_index[rows] = names.index_select(0, which).view(-1, width)
-        z = _linear(tables[9:], which, u, v[rows]).reciprocal_()
-        depth[rows] = z
-        for k in range(3):
-            barycentric[rows, :, k] = _linear(tables[3 * k : 3 * k + 3], which, u, v[rows]).mul_(z).clamp_(0, 1)
-    return Fragments(face_index, barycentric, depth)
+    face_index = torch.empty(height * width, dtype=torch.int32, device=device)
+    barycentric = torch.empty((height * width, 3), device=device)
+    depth = torch.empty(height * width, device=device)
+    rows_at_once = max(1, block // width)
+    column = torch.arange(width, dtype=torch.float64, device=device).repeat(rows_at_once)
+    for rows in _blocks(height, rows_at_once):
+        part = slice(rows.start * width, rows.stop * width)
+        row = (
+            torch.arange(rows.start, rows.stop, dtype=torch.float64, device=device)[:, None].expand(-1, width).flatten()
+        )
+        pixel = (column[: len(row)], row)
+        which = place.index_select(0, nearest[part])
+        face_index[part] = names.index_select(0, which)
+        z = _linear(tables[9:], which, pixel).reciprocal_()
+        depth[part] = z
+        for corner in range(3):
+            weight = _linear(tables[3 * corner : 3 * corner + 3], which, pixel).mul_(z)
+            barycentric[part, corner] = weight.clamp_(0, 1)
+    return Fragments(face_index.view(height, width), barycentric.view(height, width, 3), depth.view(height, width))
 
 
-def _linear(coefficients: list[Tensor], which: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """a u + b v + c at rows v [h,1] and columns u [W] -> [h,W], with the coefficients' item `which` [h * W]."""
-    a, b, c = (table.index_select(0, which).view(len(v), len(u)) for table in coefficients)
-    return a.mul_(u).add_(b.mul_(v)).add_(c)
+def _linear(coefficients: Tensor, which: Tensor, pixel: tuple[Tensor, Tensor]) -> Tensor:
+    """a u + b v + c at the pixels (u, v), [N] each, with each pixel's column `which` [N] of the coefficients [3,F]."""
+    value, slope, constant = (table.index_select(0, which) for table in coefficients.unbind())
+    return value.mul_(pixel[0]).add_(slope.mul_(pixel[1])).add_(constant)

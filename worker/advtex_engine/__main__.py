@@ -54,7 +54,7 @@ class _Terminal(Monitor):
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """"320x240" -> (320, 240)."""
+    """ "320x240" -> (320, 240)."""
     width, _, height = text.lower().partition("x")
     if not (width.isdigit() and height.isdigit()):
         raise argparse.ArgumentTypeError(f"{text!r} is not a size; write WIDTHxHEIGHT, for example 320x240")
@@ -115,9 +115,7 @@ def _texture(arguments: argparse.Namespace) -> int:
     names = ("preset", "method", "size", "holdout", "steps", "face_budget", "max_texture_size", "device", "seed")
     config = TextureConfig(**{name: getattr(arguments, name) for name in names})
     out: Path = arguments.out
-    result = texture_scan(
-        arguments.scan, out, config, work=out / "work", resume=arguments.resume, monitor=_Terminal()
-    )
+    result = texture_scan(arguments.scan, out, config, work=out / "work", resume=arguments.resume, monitor=_Terminal())
     for path in result.files:
         print(path)
     return 0

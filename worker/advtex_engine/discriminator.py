@@ -44,6 +44,9 @@ class PatchDiscriminator(nn.Module):
 
 def patch_shares(mask: Tensor) -> Tensor:
     """Share of each patch's receptive field, inside the image, that a mask [B,1,H,W] covers -> [B,1,H//8-2,W//8-2]."""
-    return F.avg_pool2d(
-        mask.to(torch.float32), RECEPTIVE_FIELD, PATCH_STRIDE, padding=-PATCH_OFFSET, count_include_pad=False
+    # Rows, then columns: 140 additions per patch and not 4,900.
+    padding = -PATCH_OFFSET
+    rows = F.avg_pool2d(
+        mask.to(torch.float32), (RECEPTIVE_FIELD, 1), (PATCH_STRIDE, 1), (padding, 0), count_include_pad=False
     )
+    return F.avg_pool2d(rows, (1, RECEPTIVE_FIELD), (1, PATCH_STRIDE), (0, padding), count_include_pad=False)

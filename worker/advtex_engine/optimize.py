@@ -87,8 +87,9 @@ class AdversarialOptimizer:
         self.adam_discriminator = _adam(self.parameters, preset.lr_discriminator, preset.beta1)
         self.bfloat16 = native_bfloat16(device)
         self.crop = crop_size(maps.width, maps.height)
-        rows = torch.arange(self.crop[1], device=device)[:, None] * maps.width
-        self._window = (rows + torch.arange(self.crop[0], device=device)).flatten()
+        rows, columns = torch.arange(self.crop[1], device=device), torch.arange(self.crop[0], device=device)
+        self._window = (rows[:, None] * maps.width + columns).flatten()
+        self._window_xy = torch.stack((columns.repeat(len(rows)), rows.repeat_interleave(len(columns))), 1) + 0.5
         self._texture_size = torch.tensor(maps.slot_map.shape[::-1], dtype=torch.float32, device=device)
         self._slot_map = maps.slot_map.flatten()
         self._sums = torch.zeros(len(LOSS_NAMES), device=device)
@@ -112,17 +113,17 @@ class AdversarialOptimizer:
         top = _pick(random[3], maps.height - height + 1)
         pixels = self._window + (top * maps.width + left)
         flat = pixels + source * (maps.width * maps.height)
-        depth = maps.depth.view(-1)[flat].to(torch.float32)
+        depth = maps.depth.view(-1).index_select(0, flat).to(torch.float32)
         foreground = depth > 0
-        points = unproject_pixels(pixels, depth, maps.intrinsics[source], maps.width)
+        points = unproject_pixels(self._window_xy + torch.stack((left, top)), depth, maps.intrinsics[source])
         real, visible = reproject(points, self.pairs.relative[source, candidate], maps, auxiliary, self.tolerance)
         visible = visible & foreground
-        uv = decode_uv(maps.uv.view(-1, 2)[flat])
+        uv = decode_uv(maps.uv.view(-1, 2).index_select(0, flat))
         texels, weights = bilinear_footprint(uv * self._texture_size, maps.slot_map.shape[1], maps.slot_map.shape[0])
         # A background pixel has uv 0; its weight is 0, so any row may stand for the texel that nobody owns.
-        slots = self._slot_map[texels].clamp(min=0)
+        slots = self._slot_map.index_select(0, texels.flatten()).view(texels.shape).clamp(min=0)
         return Batch(
-            condition=self._image(maps.color.view(-1, 3)[flat].to(torch.float32) / 127.5 - 1),
+            condition=self._image(maps.color.view(-1, 3).index_select(0, flat).to(torch.float32) / 127.5 - 1),
             real=self._image(real / 127.5 - 1),
             foreground=self._image(foreground.to(torch.float32)[:, None]),
             visible=self._image(visible.to(torch.float32)[:, None]),

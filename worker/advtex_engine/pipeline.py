@@ -14,7 +14,6 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
 
 from advtex_engine.atlas import build_atlas
 from advtex_engine.cameras import scaled_camera
@@ -97,7 +96,7 @@ def texture_scan(
 
 
 def choose_device(name: str) -> torch.device:
-    """"auto" is the GPU when there is one. Raises OptionError for a device that is not there."""
+    """ "auto" is the GPU when there is one. Raises OptionError for a device that is not there."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:

@@ -15,40 +15,42 @@ from advtex_engine.texture import bilinear_footprint
 if TYPE_CHECKING:
     from advtex_engine.views import ViewMaps
 
+MIN_DEPTH = 1e-6  # metres; nearer points have no projection
 MIN_FOREGROUND_WEIGHT = 0.99  # share of the bilinear footprint that must be foreground in the auxiliary view
 
 
-def unproject_pixels(pixels: Tensor, depth: Tensor, intrinsics: Tensor, width: int) -> Tensor:
-    """Camera-space points [P,3], metres, of flat pixel indices [P] with depth [P] along z; intrinsics [4] fx,fy,cx,cy."""
-    x = (pixels % width).to(torch.float32) + 0.5
-    y = torch.div(pixels, width, rounding_mode="floor").to(torch.float32) + 0.5
-    fx, fy, cx, cy = intrinsics.unbind()
-    return torch.stack(((x - cx) / fx * depth, (y - cy) / fy * depth, depth), 1)
+def unproject_pixels(xy: Tensor, depth: Tensor, intrinsics: Tensor) -> Tensor:
+    """Camera-space points [P,3], metres, of pixel positions xy [P,2] with depth [P] along z.
+
+    xy in pixels, first centre at (0.5, 0.5); intrinsics: [4] fx, fy, cx, cy.
+    """
+    on_plane = (xy - intrinsics[2:]) / intrinsics[:2]
+    return torch.cat((on_plane * depth[:, None], depth[:, None]), 1)
 
 
 def _project(points: Tensor, relative: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
-    """Source-camera points [P,3] -> pixel positions [P,2] in the auxiliary view and depth [P] there."""
-    moved = points @ relative[:, :3].T + relative[:, 3]
-    z = moved[:, 2]
-    safe = torch.where(z > 1e-6, z, 1.0)
-    fx, fy, cx, cy = intrinsics.unbind()
-    return torch.stack((fx * moved[:, 0] / safe + cx, fy * moved[:, 1] / safe + cy), 1), z
+    """Source-camera points [P,3] -> pixel positions [...,P,2] and depth [...,P] in auxiliary views.
+
+    relative: [...,3,4]; intrinsics: [...,4].
+    """
+    moved = points @ relative[..., :3].mT + relative[..., None, :, 3]
+    z = moved[..., 2:]
+    on_plane = moved[..., :2] / torch.where(z > MIN_DEPTH, z, 1.0)
+    return on_plane * intrinsics[..., None, :2] + intrinsics[..., None, 2:], z[..., 0]
 
 
 def _visible(
     position: Tensor, z: Tensor, maps: ViewMaps, auxiliary: Tensor, tolerance: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The visibility test; also the footprint [P,4] (indices, weights) that samples the auxiliary view's color."""
-    inside = (
-        (z > 1e-6)
-        & (position[:, 0] >= 0.5)
-        & (position[:, 0] <= maps.width - 0.5)
-        & (position[:, 1] >= 0.5)
-        & (position[:, 1] <= maps.height - 0.5)
-    )
+    """The visibility test [P]; also the footprint [P,4] (flat indices, weights) that samples the auxiliary color.
+
+    position [P,2], z [P]; auxiliary: view index, 0-dim or [P].
+    """
+    x, y = position.unbind(1)
+    inside = (z > MIN_DEPTH) & (x >= 0.5) & (x <= maps.width - 0.5) & (y >= 0.5) & (y <= maps.height - 0.5)
     indices, weights = bilinear_footprint(torch.where(inside[:, None], position, 0.5), maps.width, maps.height)
-    indices = indices + auxiliary * (maps.width * maps.height)
-    depth = maps.depth.view(-1)[indices].to(torch.float32)
+    indices = indices + auxiliary[..., None] * (maps.width * maps.height)
+    depth = maps.depth.view(-1).index_select(0, indices.flatten()).view(indices.shape).to(torch.float32)
     foreground = depth > 0
     # The nearest of the four neighbors decides: a single one would fail along every slanted surface and depth edge.
     difference = torch.where(foreground, (depth - z[:, None]).abs(), torch.inf).amin(1)
@@ -56,15 +58,15 @@ def _visible(
     return inside & covered & (difference < tolerance), indices, weights
 
 
-def auxiliary_visibility(
-    points: Tensor, relative: Tensor, maps: ViewMaps, auxiliary: Tensor, tolerance: float
-) -> Tensor:
-    """Which source-camera points [P,3] (metres) the auxiliary view sees -> [P] bool.
+def seen_share(points: Tensor, relative: Tensor, maps: ViewMaps, auxiliary: Tensor, tolerance: float) -> Tensor:
+    """Share of source-camera points [P,3] (metres) that each of K auxiliary views sees -> [K].
 
-    relative: [3,4] source camera to auxiliary camera. auxiliary: 0-dim int64 view index. tolerance: theta_z, metres.
+    relative: [K,3,4] source camera to auxiliary cameras. auxiliary: [K] view indices. tolerance: theta_z, metres.
     """
     position, z = _project(points, relative, maps.intrinsics[auxiliary])
-    return _visible(position, z, maps, auxiliary, tolerance)[0]
+    views = auxiliary[:, None].expand_as(z).flatten()
+    visible = _visible(position.flatten(0, 1), z.flatten(), maps, views, tolerance)[0]
+    return visible.view_as(z).to(torch.float32).mean(1)
 
 
 def reproject(
@@ -72,9 +74,10 @@ def reproject(
 ) -> tuple[Tensor, Tensor]:
     """The auxiliary image warped into the source view: colors [P,3] in [0,255] and visibility [P] bool.
 
-    Arguments as in `auxiliary_visibility`. Colors are bilinear; where invisible they mean nothing.
+    points: [P,3] metres in the source camera. relative: [3,4] source camera to auxiliary camera. auxiliary: 0-dim view
+    index. tolerance: theta_z, metres. Colors are bilinear; where invisible they mean nothing.
     """
     position, z = _project(points, relative, maps.intrinsics[auxiliary])
     visible, indices, weights = _visible(position, z, maps, auxiliary, tolerance)
-    corners = maps.color.view(-1, 3)[indices].to(torch.float32)
+    corners = maps.color.view(-1, 3).index_select(0, indices.flatten()).view(*indices.shape, 3).to(torch.float32)
     return (corners * weights[:, :, None]).sum(1), visible

@@ -6,18 +6,20 @@ Per view and pixel: color 3 bytes, uv 4 bytes (two int16), depth 2 bytes (float1
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from advtex_engine.rasterize import rasterize_views
-from advtex_engine.reproject import auxiliary_visibility, unproject_pixels
+from advtex_engine.reproject import seen_share, unproject_pixels
 from advtex_engine.scene import Atlas, View
 from advtex_engine.texture import encode_uv, touched_slots
 
 DEPTH_TOLERANCE = {"object": 0.03, "scene": 0.1}  # theta_z, metres (paper section 3.3)
-OVERLAP_STRIDE = 4  # pixels; overlaps are estimated on a coarser grid
+OVERLAP_STRIDE = 8  # pixels; overlaps are estimated on a coarser grid
+WIDEST_PAIR = 60.0  # degrees between the optical axes, for views that have no nearer neighbor
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,9 @@ def build_view_maps(atlas: Atlas, views: tuple[View, ...], kind: str) -> ViewMap
     Device depth masks what the mesh lacks: a pixel whose measured depth differs from the mesh's by more than theta_z
     shows something else than the mesh.
     """
-    assert views and all((v.camera.width, v.camera.height) == (views[0].camera.width, views[0].camera.height) for v in views)
+    assert views and all(
+        (v.camera.width, v.camera.height) == (views[0].camera.width, views[0].camera.height) for v in views
+    )
     mesh, device = atlas.mesh, atlas.mesh.v_pos.device
     assert mesh.v_uv is not None and mesh.t_uv_idx is not None
     width, height, tolerance = views[0].camera.width, views[0].camera.height, DEPTH_TOLERANCE[kind]
@@ -100,29 +104,29 @@ def build_view_maps(atlas: Atlas, views: tuple[View, ...], kind: str) -> ViewMap
     )
 
 
-def overlaps(maps: ViewMaps, kind: str, max_angle: float) -> Tensor:
+def overlaps(maps: ViewMaps, kind: str, max_angle: float, sources: Iterable[int]) -> Tensor:
     """Share [V,V] of each source's foreground that the auxiliary view sees too; 0 beyond max_angle (degrees).
 
-    The angle is that between the optical axes. Estimated on every OVERLAP_STRIDE-th pixel.
+    The angle is that between the optical axes. Estimated on every OVERLAP_STRIDE-th pixel, for the given sources only.
     """
-    device, count = maps.depth.device, maps.count
+    device = maps.depth.device
     axes = maps.world_to_camera[:, 2, :3]
     near = (axes @ axes.T).clamp(-1, 1) >= math.cos(math.radians(max_angle))
     ys = torch.arange(OVERLAP_STRIDE // 2, maps.height, OVERLAP_STRIDE, device=device)
     xs = torch.arange(OVERLAP_STRIDE // 2, maps.width, OVERLAP_STRIDE, device=device)
-    pixels = (ys[:, None] * maps.width + xs[None, :]).flatten()
-    share = torch.zeros((count, count), device=device)
+    pixels = (ys[:, None] * maps.width + xs).flatten()
+    xy = torch.stack((xs.repeat(len(ys)), ys.repeat_interleave(len(xs))), 1) + 0.5
+    share = torch.zeros((maps.count, maps.count), device=device)
     camera_to_world = torch.linalg.inv(maps.world_to_camera)
-    for source in range(count):
+    for source in sources:
         depth = maps.depth[source, pixels].to(torch.float32)
         seen = depth > 0
+        auxiliary = near[source].nonzero().flatten()
         if not bool(seen.any()):
             continue
-        points = unproject_pixels(pixels[seen], depth[seen], maps.intrinsics[source], maps.width)
-        for auxiliary in near[source].nonzero().flatten().tolist():
-            relative = (maps.world_to_camera[auxiliary] @ camera_to_world[source])[:3].to(torch.float32)
-            visible = auxiliary_visibility(points, relative, maps, torch.tensor(auxiliary, device=device), DEPTH_TOLERANCE[kind])
-            share[source, auxiliary] = visible.to(torch.float32).mean()
+        points = unproject_pixels(xy[seen], depth[seen], maps.intrinsics[source])
+        relative = (maps.world_to_camera[auxiliary] @ camera_to_world[source])[:, :3].to(torch.float32)
+        share[source, auxiliary] = seen_share(points, relative, maps, auxiliary, DEPTH_TOLERANCE[kind])
     return share
 
 
@@ -133,11 +137,11 @@ def related_pairs(maps: ViewMaps, kind: str, max_angle: float, min_overlap: floa
     it most, whatever the angle, so that sparse scans still learn from misaligned pairs.
     """
     count, device = maps.count, maps.depth.device
-    share = overlaps(maps, kind, max_angle)
+    share = overlaps(maps, kind, max_angle, range(count))
     related = (share > min_overlap).fill_diagonal_(False)
     lonely = (~related.any(1)).nonzero().flatten().tolist()
     if lonely:
-        wide = overlaps(maps, kind, 60.0).fill_diagonal_(0.0)
+        wide = overlaps(maps, kind, WIDEST_PAIR, lonely).fill_diagonal_(0.0)
         for source in lonely:
             best = int(wide[source].argmax())
             related[source, best] = bool(wide[source, best] > min_overlap)
@@ -147,4 +151,6 @@ def related_pairs(maps: ViewMaps, kind: str, max_angle: float, min_overlap: floa
     has_foreground = (maps.depth > 0).any(1)
     number = torch.tensor([len(row) for row in candidates], device=device) * has_foreground
     relative = maps.world_to_camera[auxiliary] @ torch.linalg.inv(maps.world_to_camera)[:, None]
-    return Pairs(auxiliary, number, has_foreground.nonzero().flatten(), relative[:, :, :3].to(torch.float32).contiguous())
+    return Pairs(
+        auxiliary, number, has_foreground.nonzero().flatten(), relative[:, :, :3].to(torch.float32).contiguous()
+    )

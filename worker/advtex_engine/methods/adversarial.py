@@ -68,7 +68,9 @@ def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     return texture.clamp(0, 1), run.losses
 
 
-def _run_level(given: MethodInput, optimizer: AdversarialOptimizer, run: _Run, end: int, timer: CheckpointTimer) -> None:
+def _run_level(
+    given: MethodInput, optimizer: AdversarialOptimizer, run: _Run, end: int, timer: CheckpointTimer
+) -> None:
     total = given.preset.steps
     every = max(1, total // HISTORY_POINTS)
     while run.step < end:

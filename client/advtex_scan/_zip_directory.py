@@ -219,8 +219,8 @@ def _locate(descriptor: int, directory: int, entries: list[_Entry], problems: Fi
     """Follow each entry to its bytes; they must lie between its own header and the next one."""
     extents: dict[str, Extent] = {}
     ordered = sorted(entries, key=lambda entry: entry.header)
-    for entry, following in zip(ordered, [*ordered[1:], None], strict=True):
-        bound = following.header if following else directory
+    bounds = [*(entry.header for entry in ordered), directory][1:]
+    for entry, bound in zip(ordered, bounds, strict=True):
         shown = repr(entry.name)[1:-1][:200]
         local = os.pread(descriptor, LOCAL.size, min(entry.header, directory))
         if len(local) != LOCAL.size or local[:4] != b"PK\x03\x04":

@@ -72,7 +72,7 @@ def look_at(angle: float, distance: float = 2.0) -> list[list[float]]:
     down = (0.0, 0.0, -1.0)
     place = (-distance * forward[0], -distance * forward[1], 0.0)
     rows = [[right[i], down[i], forward[i], place[i]] for i in range(3)]
-    return [[-row[0], *row[1:]] for row in rows] + [[0.0, 0.0, 0.0, 1.0]]
+    return [*rows, [0.0, 0.0, 0.0, 1.0]]
 
 
 @dataclass

@@ -67,6 +67,7 @@ SCAN_KEYS = frozenset(
     ]
 )
 FRAME_KEYS = frozenset(["name", "color", "depth", "camera_to_world", "color_intrinsics", "depth_intrinsics"])
+CAMERAS = ("color_intrinsics", "depth_intrinsics")
 INTRINSICS_KEYS = ("fx", "fy", "cx", "cy", "width", "height")
 Json = Mapping[str, Any]
 
@@ -90,7 +91,7 @@ def read(reader: ScanReader) -> ScanManifest | None:
         message = f"lists {len(frames)} frames; at most {MAX_FRAMES} are accepted"
         reader.findings.error("too_many_frames", FILE, message, "split the scan")
         frames = []
-    common = {kind: _intrinsics(reader, scan.get(kind), kind) for kind in ("color_intrinsics", "depth_intrinsics")}
+    common = {kind: _intrinsics(reader, scan[kind], kind) for kind in CAMERAS if scan.get(kind) is not None}
     reader.frames_found = len(frames)
     entries = [_frame(reader, frame, index, common) for index, frame in enumerate(frames)]
     depth_to_color = IDENTITY
@@ -136,20 +137,21 @@ def _frame(reader: ScanReader, frame: Any, index: int, common: Mapping[str, Intr
     color = _path(reader, frame.get("color"), f"{where}.color")
     depth = None if frame.get("depth") is None else _path(reader, frame["depth"], f"{where}.depth")
     pose = _pose(reader, frame.get("camera_to_world"), f"{where}.camera_to_world")
-    own = {
-        kind: _intrinsics(reader, frame.get(kind), f"frames[{index}].{kind}") if kind in frame else common[kind]
-        for kind in common
-    }
-    if own["color_intrinsics"] is None and frame.get("color_intrinsics") is None:
+    given = [kind for kind in CAMERAS if frame.get(kind) is not None]
+    cameras = {**common, **{kind: _intrinsics(reader, frame[kind], f"frames[{index}].{kind}") for kind in given}}
+    if "color_intrinsics" not in cameras:
         remedy = "give color_intrinsics once at the top or in each frame"
         reader.findings.error("no_color_intrinsics", where, "has no color_intrinsics", remedy)
+    if "depth_intrinsics" in cameras and cameras["depth_intrinsics"] is None:
+        depth = None  # given, but found wrong and reported above
     name = frame.get("name", f"{index:06d}")
     if not isinstance(name, str) or not name.isprintable() or not 0 < len(name) <= 200:
         reader.findings.error("bad_value", f"{where}.name", "is no printable text", "give each frame a short name")
         return None
-    if color is None or pose is None or own["color_intrinsics"] is None:
+    color_camera = cameras.get("color_intrinsics")
+    if color is None or pose is None or color_camera is None:
         return None
-    return FrameEntry(name, color, depth, pose, own["color_intrinsics"], own["depth_intrinsics"])
+    return FrameEntry(name, color, depth, pose, color_camera, cameras.get("depth_intrinsics"))
 
 
 def _unknown_keys(reader: ScanReader, value: Json, known: frozenset[str], where: str) -> None:
@@ -222,8 +224,6 @@ def _rigid(reader: ScanReader, value: Any, key: str) -> Matrix4 | None:
 
 
 def _intrinsics(reader: ScanReader, value: Any, key: str) -> Intrinsics | None:
-    if value is None:
-        return None
     where = f"{FILE}: {key}"
     numbers = [_number(value.get(name)) for name in INTRINSICS_KEYS] if isinstance(value, dict) else [None]
     sizes = numbers[4:]

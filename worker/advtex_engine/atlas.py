@@ -15,7 +15,7 @@ from torch import Tensor
 
 from advtex_engine.config import TextureConfig
 from advtex_engine.density import face_areas, pixel_density
-from advtex_engine.errors import Problem, ScanError
+from advtex_engine.errors import OptionError, Problem, ScanError
 from advtex_engine.monitor import Monitor
 from advtex_engine.scene import Atlas, Camera, Mesh
 
@@ -25,10 +25,14 @@ Integers = npt.NDArray[np.int64]
 # The texture's sides are multiples of this, so that coarse levels of a pyramid divide them.
 SIZE_STEP = 64
 MIN_SIZE = 256
-# Texels kept free around each chart: bilinear sampling touches one, and half-size pyramid levels halve what is left.
-PADDING = 4
+# Texels around each chart, so that twice as many lie between two: bilinear sampling touches one on either side, and
+# as much is left at half the size, which coarse pyramid levels sample.
+PADDING = 2
 # xatlas merges faces into a chart up to this cost; its default of 2 makes twice the charts in a third more time.
 CHART_COST = 8.0
+# Charts are grown in blocks of at most so many faces: xatlas's time grows faster than a block's size, and blocks run
+# side by side on several cores, with the same result. 80k faces: 8 s instead of 22 s on one core, as many charts.
+BLOCK_FACES = 3_000
 # Texel density of what no camera sees, and the least of what one does, relative to the scan's mean density.
 UNSEEN_DENSITY = 0.05
 # Each round of packing shrinks the charts by what they overshot the cap, and a little more.
@@ -149,28 +153,44 @@ def _new_atlas(mesh: Mesh, wanted: Floats, config: TextureConfig) -> Atlas:
             )
             return Atlas(packed, size, size, "xatlas", int(charts.chart.max()) + 1)
         charts = replace(charts, uv=charts.uv * (cap / side * SHRINK_MARGIN))
-    raise ScanError(
-        Problem(
-            "atlas_too_large",
-            "mesh",
-            f"the mesh's {charts.chart.max() + 1:,} charts do not fit a texture of {cap} texels",
-            "raise the texture's maximal size, or simplify the mesh and remove its small loose pieces",
-        )
+    raise OptionError(
+        f"the mesh's {charts.chart.max() + 1:,} charts do not fit a texture of {cap} texels; raise the maximal texture "
+        "size, lower the face budget, or remove small loose pieces from the mesh"
     )
 
 
 def _make_charts(mesh: Mesh) -> _Charts:
     """Cut the mesh into charts (xatlas) and flatten them. Faces and their corners keep their order."""
     atlas = xatlas.Atlas()
-    atlas.add_mesh(mesh.v_pos.numpy(), mesh.t_pos_idx.numpy().astype(np.uint32))
+    position, faces = mesh.v_pos.numpy(), mesh.t_pos_idx.numpy()
+    blocks = _split(position[faces].mean(axis=1), np.arange(len(faces)))
+    for block in blocks:
+        used, local = np.unique(faces[block], return_inverse=True)
+        atlas.add_mesh(position[used], local.reshape(-1, 3).astype(np.uint32))
     options = xatlas.ChartOptions()
     options.max_cost = CHART_COST
     atlas.generate(options, _pack_options())
-    _, faces, uv = atlas[0]
-    chart = np.full(len(faces), -1, dtype=np.int64)
-    for index in range(atlas.chart_count):
-        chart[np.asarray(atlas.get_mesh_chart(0, index).faces)] = index
-    return _Charts(uv * np.array([atlas.width, atlas.height], dtype=np.float64), faces.astype(np.int64), chart)
+    t_uv_idx, chart = np.zeros_like(faces), np.zeros(len(faces), dtype=np.int64)
+    uv, vertices, charts = list[Floats](), 0, 0
+    for index, block in enumerate(blocks):
+        _, local, block_uv = atlas[index]
+        t_uv_idx[block] = local.astype(np.int64) + vertices
+        for number in range(atlas.get_mesh_chart_count(index)):
+            chart[block[np.asarray(atlas.get_mesh_chart(index, number).faces)]] = charts + number
+        uv.append(block_uv * np.array([atlas.width, atlas.height], dtype=np.float64))
+        vertices, charts = vertices + len(block_uv), charts + atlas.get_mesh_chart_count(index)
+    return _Charts(np.concatenate(uv), t_uv_idx, chart)
+
+
+def _split(centroid: npt.NDArray[np.float32], faces: Integers) -> list[Integers]:
+    """Halve a set of faces along its longest axis until each part has at most BLOCK_FACES."""
+    if len(faces) <= BLOCK_FACES:
+        return [faces]
+    place = centroid[faces]
+    axis = int(np.argmax(place.max(axis=0) - place.min(axis=0)))
+    order = faces[np.argsort(place[:, axis], kind="stable")]
+    half = len(order) // 2
+    return _split(centroid, np.sort(order[:half])) + _split(centroid, np.sort(order[half:]))
 
 
 def _scale_charts(charts: _Charts, wanted: Floats) -> Floats:
@@ -199,14 +219,14 @@ def _pack(charts: _Charts) -> tuple[Floats, int]:
 
 
 def _pack_options(texels_per_unit: float = 0.0) -> Any:
-    """Random placement: brute force takes minutes. Block alignment packs faster at the same efficiency.
+    """Charts go where there is room first: brute force takes minutes, and alignment to blocks of 4 texels costs 4 %.
 
     xatlas's `resolution` is no cap, so none is given.
     """
     options = xatlas.PackOptions()
     options.padding = PADDING
-    options.bilinear = True
-    options.blockAlign = True
+    options.bilinear = False
+    options.blockAlign = False
     options.bruteForce = False
     options.create_image = False
     options.texels_per_unit = texels_per_unit

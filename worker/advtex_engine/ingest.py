@@ -227,6 +227,8 @@ def _imdecode(data: bytes, ref: FileRef, flags: int) -> npt.NDArray[Any]:
                 "scale the images down",
             )
         )
+    if not _is_complete(data, header.format):
+        raise ScanError(_broken(ref, "is cut off: its end is missing"))
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
@@ -234,6 +236,13 @@ def _imdecode(data: bytes, ref: FileRef, flags: int) -> npt.NDArray[Any]:
     if image is None:
         raise ScanError(_broken(ref, "cannot be decoded"))
     return image
+
+
+def _is_complete(data: bytes, format_: str) -> bool:
+    """Whether the end marker is there; OpenCV fills what a cut-off image lacks with grey and says nothing."""
+    if format_ == "png":
+        return data.rfind(b"IEND") > data.rfind(b"IDAT")
+    return data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")  # end of image after the last start of scan
 
 
 def _check_size(ref: FileRef, image: npt.NDArray[Any], intrinsics: Intrinsics) -> None:

@@ -80,13 +80,16 @@ def read_ply(data: bytes) -> Polygons:
     read = _PlyAscii(body) if byte_order == "" else _PlyBinary(body, byte_order)
     columns: dict[str, dict[str, Any]] = {element.name: read.element(element) for element in elements}
     vertex, face = columns.get("vertex", {}), columns.get("face", {})
+    vertex = {name: column for name, column in vertex.items() if isinstance(column, np.ndarray)}
+    face = {name: column for name, column in face.items() if isinstance(column, tuple)}
     if not {"x", "y", "z"} <= vertex.keys():
         raise MeshFormatError("has no vertices with x, y and z")
     position = np.stack([vertex[axis].astype(np.float64) for axis in "xyz"], axis=1)
     lists = face.get("vertex_indices", face.get("vertex_index"))
     if lists is None:
         raise MeshFormatError("has no faces")
-    sizes, corners = lists[0], lists[1].astype(np.int64)
+    with np.errstate(invalid="ignore"):  # what is no number becomes an index out of range
+        sizes, corners = lists[0], lists[1].astype(np.int64)
     if "texcoord" in face and np.array_equal(face["texcoord"][0], 2 * sizes):
         uv = flip_v(face["texcoord"][1].astype(np.float64).reshape(-1, 2))
         return Polygons(position, corners, sizes, uv, np.arange(len(uv)))
@@ -118,6 +121,8 @@ def _ply_header(data: bytes) -> tuple[str, list[PlyElement], bytes]:
                 elements[-1].properties.append(PlyProperty(words[2], PLY_TYPES[words[1]]))
     except (LookupError, ValueError) as error:
         raise MeshFormatError(f"has a PLY header that cannot be read (near {line!r})") from error
+    if any(len({prop.name for prop in element.properties}) < len(element.properties) for element in elements):
+        raise MeshFormatError("has a PLY header that names a property twice")
     if any(not 0 <= element.count <= len(body) for element in elements):
         raise MeshFormatError("is shorter than its header says; the file is incomplete")
     return byte_order, elements, body
@@ -129,7 +134,7 @@ class _PlyBinary:
 
     def element(self, element: PlyElement) -> dict[str, Any]:
         """Columns by property name: an array, or (lengths, values) for a list."""
-        if element.count == 0:
+        if element.count == 0 or not element.properties:
             return {}
         # Nearly every file has lists of one length: read the first row's lengths and try them on all rows.
         lengths = self._row_lengths(element)
@@ -162,6 +167,8 @@ class _PlyBinary:
                 length = int(self._take(prop.count_type, 1, offset)[0])
                 offset += np.dtype(prop.count_type).itemsize
             offset += np.dtype(prop.type).itemsize * length
+            if length < 0 or offset > len(self._body):
+                raise MeshFormatError("is shorter than its header says; the file is incomplete")
             lengths.append(length)
         return lengths
 
@@ -183,7 +190,7 @@ class _PlyBinary:
 
     def _take(self, type_: str, count: int, offset: int) -> npt.NDArray[Any]:
         dtype = np.dtype(self._order + type_)
-        if count < 0 or offset + count * dtype.itemsize > len(self._body):
+        if offset + count * dtype.itemsize > len(self._body):
             raise MeshFormatError("is shorter than its header says; the file is incomplete")
         return np.frombuffer(self._body, dtype, count, offset)
 
@@ -209,7 +216,7 @@ class _PlyAscii:
                         length, at = int(words[at]), at + 1
                     row = [float(word) for word in words[at : at + length]]
                     if len(row) != length:
-                        raise MeshFormatError(f"has a line that is too short: {line[:80]!r}")
+                        raise IndexError(length)
                     values[index] += row
                     lengths[index].append(length)
                     at += length

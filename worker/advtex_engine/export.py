@@ -46,7 +46,8 @@ def export_model(out: Path, atlas: Atlas, texture: Tensor, *, up_axis: str, name
     texture: [atlas.height,atlas.width,3] uint8 sRGB, or float in [0,1] (clamped). Each file is whole or absent; the
     OBJ comes after the files that it names.
     """
-    assert texture.shape == (atlas.height, atlas.width, 3) and up_axis in TO_Y_UP
+    assert texture.shape == (atlas.height, atlas.width, 3)
+    assert up_axis in TO_Y_UP
     out.mkdir(parents=True, exist_ok=True)
     mesh = _on_cpu(atlas.mesh)
     normals = vertex_normals(mesh)
@@ -84,7 +85,8 @@ def encode_png(texture: Tensor) -> bytes:
 
 
 def _on_cpu(mesh: Mesh) -> Mesh:
-    assert mesh.v_uv is not None and mesh.t_uv_idx is not None
+    assert mesh.v_uv is not None
+    assert mesh.t_uv_idx is not None
     return Mesh(mesh.v_pos.cpu(), mesh.t_pos_idx.cpu(), mesh.v_uv.cpu(), mesh.t_uv_idx.cpu())
 
 
@@ -97,7 +99,8 @@ def _mtl(image: str) -> str:
 
 
 def _write_obj(path: Path, mesh: Mesh, normals: Tensor, mtl: str) -> None:
-    assert mesh.v_uv is not None and mesh.t_uv_idx is not None
+    assert mesh.v_uv is not None
+    assert mesh.t_uv_idx is not None
     uv = mesh.v_uv.double()
     flipped = torch.stack((uv[:, 0], 1 - uv[:, 1]), dim=1)
     position, corner = mesh.t_pos_idx + 1, mesh.t_uv_idx + 1
@@ -197,7 +200,8 @@ def _split_at_seams(mesh: Mesh, normals: Tensor) -> tuple[Array, Array, Array, A
 
     Returns indices [3T] (uint16 where they fit: 65535 is reserved), positions [N,3], normals [N,3], uv [N,2] float32.
     """
-    assert mesh.v_uv is not None and mesh.t_uv_idx is not None
+    assert mesh.v_uv is not None
+    assert mesh.t_uv_idx is not None
     uv_count = len(mesh.v_uv)
     key = (mesh.t_pos_idx * uv_count + mesh.t_uv_idx).flatten()
     pairs, index = torch.unique(key, return_inverse=True)

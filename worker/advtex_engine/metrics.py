@@ -158,8 +158,7 @@ def eroded(mask: Tensor, radius: int) -> Tensor:
 
 
 def _check(image: Tensor, truth: Tensor, mask: Tensor) -> None:
-    assert image.ndim == 3 and image.shape[2] == 3
-    assert image.shape == truth.shape and mask.shape == image.shape[:2]
+    assert image.shape == truth.shape == (*mask.shape, 3)
     assert mask.dtype == torch.bool
 
 

@@ -38,9 +38,11 @@ def render_view(
 
 def render_layers(atlas: Atlas, texture: Tensor, camera: Camera, *, supersample: int = 2) -> tuple[Tensor, Tensor]:
     """Color [H,W,3] times coverage, and coverage [H,W], both float32 in [0,1]: what `render_view` puts together."""
-    assert texture.shape == (atlas.height, atlas.width, 3) and supersample >= 1
+    assert texture.shape == (atlas.height, atlas.width, 3)
+    assert supersample >= 1
     mesh = atlas.mesh
-    assert mesh.v_uv is not None and mesh.t_uv_idx is not None
+    assert mesh.v_uv is not None
+    assert mesh.t_uv_idx is not None
     texels = texture.to(torch.float32) / (255 if texture.dtype == torch.uint8 else 1)
     width, height = camera.width * supersample, camera.height * supersample
     fragments = rasterize(mesh, scaled_camera(camera, width, height))
@@ -65,7 +67,8 @@ def contact_sheet(views: Sequence[View], rows: Sequence[Sequence[Tensor]], capti
 
     rows: per view the pictures [H,W,3] float sRGB in [0,1], as many as `captions`.
     """
-    assert views and len(views) == len(rows) and all(len(row) == len(captions) for row in rows)
+    assert len(views) == len(rows) > 0
+    assert all(len(row) == len(captions) for row in rows)
     titles = ("photograph", *captions)
     lines = [
         _row((view.color.to(torch.float32) / 255, *row), titles, view.name)

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from advtex_engine import synthetic_object
 from advtex_engine.cameras import camera_to_world
+from advtex_engine.errors import OptionError
 from advtex_engine.export import export_model, vertex_normals
 from advtex_engine.meshio import read_obj
 from advtex_engine.metrics import score_views
@@ -56,19 +57,21 @@ FOCAL = 1.05
 """Focal length over the image's width: a phone's field of view."""
 SUPERSAMPLE = 3
 EXPOSURE_SPREAD = 0.04
-"""Standard deviation of the frames' exposure, in stops times ln 2."""
+"""Standard deviation of the logarithm of the frames' exposure."""
 SENSOR_NOISE = 1.5
 """Standard deviation in gray levels of 255."""
 DEPTH_NOISE = 0.001
 """Standard deviation in metres."""
 DEPTH_SCALE = 1000.0
 HELDOUT_VIEWS = 8
+MIN_VIEWS, MIN_SIDE = 3, 16
+TRUTH = "truth/cameras.json"
 BACKDROP = 0.8
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A view of the synthetic scan: the camera as it was, and its place in the scan."""
+    """A view of the synthetic scan, and the camera as it was."""
 
     name: str
     camera: Camera
@@ -87,20 +90,24 @@ def synthesize(
     """Write a synthetic scan: a zip when `out` ends in .zip, else a folder, which is replaced if it is one of these.
 
     views: frames of width x height pixels. camera_error: e_t in metres; e_a is the angle that moves the image as far
-    (e_t / DISTANCE). geometry_error: e_g in metres. The same arguments make the same scan.
+    (e_t / DISTANCE). geometry_error: e_g in metres. The same arguments make the same scan. Raises OptionError for
+    numbers out of bounds and for a folder that holds something else.
     """
-    assert views >= 3 and width >= 16 and height >= 16
-    with tempfile.TemporaryDirectory(prefix="advtex-synthesize-", dir=out.resolve().parent) as work:
+    if views < MIN_VIEWS or min(width, height) < MIN_SIDE:
+        raise OptionError(f"{views} views of {width}x{height} are too few or too small; at least 3 of 16x16 are needed")
+    if camera_error < 0 or geometry_error < 0:
+        raise OptionError(f"errors are lengths: {camera_error} and {geometry_error} must not be negative")
+    if out.is_dir() and any(out.iterdir()) and not (out / TRUTH).is_file():
+        raise OptionError(f"{out} holds something else than a synthetic scan; choose another folder or remove it")
+    out.resolve().parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".advtex-synthesize-", dir=out.resolve().parent) as work:
         folder = Path(work) / "scan"
         _write_scan(folder, views, width, height, seed, camera_error, geometry_error)
         if out.suffix == ".zip":
-            archive = Path(work) / "scan.zip"
-            _zip_folder(folder, archive)
-            archive.replace(out)
+            _zip_folder(folder, Path(work) / "scan.zip")
+            (Path(work) / "scan.zip").replace(out)
             return
         if out.exists():
-            if not (out / "truth" / "cameras.json").is_file() and any(out.iterdir()):
-                raise FileExistsError(f"{out} exists and is not a synthetic scan; choose another folder or remove it")
             shutil.rmtree(out)
         folder.rename(out)
 
@@ -108,10 +115,10 @@ def synthesize(
 def compare_to_truth(model: Path, scan: Path) -> dict[str, float]:
     """How close a result came to the truth: `score_views` of the model against the true object.
 
-    model: an OBJ that `export_model` wrote. scan: what `synthesize` wrote, folder or zip. Both objects are rendered from
-    the true held-out cameras; pixels count where both are seen.
+    model: an OBJ that `export_model` wrote. scan: what `synthesize` wrote, folder or zip. Both objects are rendered
+    from the true held-out cameras; pixels count where both are seen.
     """
-    truth = json.loads(_member(scan, "truth/cameras.json"))
+    truth = json.loads(_member(scan, TRUTH))
     K = np.array(truth["intrinsics_matrix"])
     ours = _load_model(model.read_bytes(), lambda name: (model.parent / name).read_bytes())
     theirs = _load_model(_member(scan, "truth/object.obj"), lambda name: _member(scan, f"truth/{name}"))
@@ -131,7 +138,8 @@ def compare_to_truth(model: Path, scan: Path) -> dict[str, float]:
 def _load_model(obj: bytes, read: Callable[[str], bytes]) -> tuple[Atlas, torch.Tensor]:
     """An OBJ of triangles with one texture, and that texture [H,W,3] uint8; `read` gets the files that it names."""
     polygons = read_obj(obj)
-    assert polygons.uv is not None and polygons.uv_corners is not None
+    assert polygons.uv is not None
+    assert polygons.uv_corners is not None
     mesh = Mesh(
         v_pos=torch.from_numpy(polygons.position).float(),
         t_pos_idx=torch.from_numpy(polygons.corners).view(-1, 3),
@@ -207,7 +215,7 @@ def _write_scan(
         "frames": [_pose(shot.name, camera_to_world(shot.camera).numpy()) for shot in shots],
         "heldout": [_pose(shot.name, camera_to_world(shot.camera).numpy()) for shot in heldout],
     }
-    (folder / "truth/cameras.json").write_text(json.dumps(truth, indent=1))
+    (folder / TRUTH).write_text(json.dumps(truth, indent=1))
 
 
 @contextmanager

@@ -69,19 +69,21 @@ class Blobs(ABC):
 
     def fetch(self, key: str, path: Path) -> Written:
         """Copy a blob to a local path, whole or not at all. The folder is made if need be."""
-        path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_name(path.name + ".part")
         digest, size = hashlib.sha256(), 0
+        chunks = self.stream(key)
         try:
+            path.parent.mkdir(parents=True, exist_ok=True)
             with part.open("wb") as file:
-                for chunk in self.stream(key):
+                for chunk in chunks:
                     file.write(chunk)
                     digest.update(chunk)
                     size += len(chunk)
             part.replace(path)
         except OSError as error:
-            part.unlink(missing_ok=True)
             raise _translated(error) from error
+        finally:
+            part.unlink(missing_ok=True)
         return Written(size, digest.hexdigest())
 
     def get(self, key: str) -> bytes:
@@ -251,7 +253,8 @@ class FolderBlobs(Blobs):
 
     def delete(self, key: str) -> None:
         path = self.path(key)
-        path.unlink(missing_ok=True)
+        with suppress(FileNotFoundError, IsADirectoryError, NotADirectoryError):
+            path.unlink()
         for parent in path.parents:
             if parent == self.root:
                 break

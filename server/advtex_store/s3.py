@@ -61,12 +61,20 @@ class S3Blobs(Blobs):
             obstore.delete(self._store, check_key(key))
 
     def check(self) -> None:
-        with _translated(self.bucket):
+        with self._existing_bucket():
             obstore.list_with_delimiter(self._store, prefix="jobs/none")
 
     def _publish(self, path: Path, key: str) -> None:
-        with _translated(key):
+        with self._existing_bucket():
             obstore.put(self._store, key, path, chunk_size=PART, max_concurrency=4)
+
+    @contextmanager
+    def _existing_bucket(self) -> Iterator[None]:
+        try:
+            with _translated(self.bucket):
+                yield
+        except BlobNotFound:
+            raise BlobsUnavailable(f"there is no bucket {self.bucket!r}, or the keys do not open it") from None
 
 
 def _info(meta: obstore.ObjectMeta) -> BlobInfo:

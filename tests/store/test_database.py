@@ -1,0 +1,103 @@
+"""Schema, durability settings, clocks."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from sqlalchemy import text
+from sqlalchemy.exc import IntegrityError
+
+from advtex_store.database import Database, connect, upgrade_database
+from advtex_store.models import Base
+from advtex_store.settings import StoreSettings
+
+
+def test_migrations_lead_to_the_models(database_url: str) -> None:
+    engine = connect(database_url)
+    with engine.connect() as connection:
+        context = MigrationContext.configure(connection, opts={"compare_type": True})
+        assert compare_metadata(context, Base.metadata) == []
+    engine.dispose()
+
+
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_several_servers_migrate_at_once(kind: str, tmp_path, postgres_server: str) -> None:
+    url = f"sqlite:///{tmp_path}/new.db"
+    if kind == "postgresql":
+        url = f"{postgres_server}race".replace("postgresql:", "postgresql+psycopg:")
+        admin = connect(url.replace("/race", "/postgres")).execution_options(isolation_level="AUTOCOMMIT")
+        with admin.connect() as connection:
+            connection.execute(text("create database race"))
+        admin.dispose()
+    errors: list[Exception] = []
+
+    def upgrade() -> None:
+        try:
+            upgrade_database(url)
+        except Exception as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=upgrade) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert errors == []
+    database = Database(url)
+    with database.read() as session:
+        assert session.execute(text("select count(*) from alembic_version")).scalar_one() == 1
+    database.close()
+
+
+def test_sqlite_is_durable(sqlite_url: str) -> None:
+    database = Database(sqlite_url)
+    with database.read() as session:
+        values = [session.execute(text(f"pragma {name}")).scalar() for name in ("journal_mode", "synchronous")]
+        assert values == ["wal", 2]
+        assert session.execute(text("pragma foreign_keys")).scalar() == 1
+    database.close()
+
+
+def test_a_failed_write_leaves_nothing(database_url: str) -> None:
+    database = Database(database_url)
+    insert = text(
+        "insert into uploads (id, owner, filename, size, \"offset\", created_at) values ('a', 'o', '', 1, 0, 0)"
+    )
+
+    def write_twice() -> None:
+        with database.write() as session:
+            session.execute(insert)
+            session.execute(insert)
+
+    with pytest.raises(IntegrityError):
+        write_twice()
+    with database.read() as session:
+        assert session.execute(text("select count(*) from uploads")).scalar_one() == 0
+    database.close()
+
+
+def test_the_clock_is_the_time(database_url: str) -> None:
+    database = Database(database_url)
+    with database.read() as session:
+        assert abs(database.now(session) - time.time()) < 5
+    database.close()
+
+
+def test_settings(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
+    monkeypatch.setenv("ADVTEX_DATA_DIR", str(tmp_path))
+    settings = StoreSettings()
+    assert settings.database == f"sqlite:///{tmp_path}/advtex.db"
+    assert settings.blobs == f"file://{tmp_path}/blobs"
+    assert settings.redis_password() is None
+    monkeypatch.setenv("ADVTEX_DATABASE_URL", "postgresql://u@h/d")
+    monkeypatch.setenv("ADVTEX_BLOB_URL", "s3://bucket/prefix")
+    (tmp_path / "password").write_text("secret\n")
+    monkeypatch.setenv("ADVTEX_REDIS_PASSWORD_FILE", str(tmp_path / "password"))
+    settings = StoreSettings()
+    assert settings.database == "postgresql+psycopg://u@h/d"
+    assert settings.blobs == "s3://bucket/prefix"
+    assert settings.redis_password() == "secret"

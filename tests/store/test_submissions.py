@@ -1,0 +1,115 @@
+"""New jobs, lists, idempotency keys."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import pytest
+
+from advtex_contract.jobs import JobError, JobSpec, JobState
+from advtex_store.errors import IdempotencyInFlight, IdempotencyMismatch, RecordNotFound
+from advtex_store.submissions import HOLD_SECONDS, Reservation
+
+
+def test_a_job_needs_a_finished_upload_of_its_owner(bench: Any) -> None:
+    unfinished = bench.uploads.create(bench.owner, 3).id
+    foreign = bench.finished_upload("somebody else")
+    for upload_id in (unfinished, foreign, "none"):
+        with pytest.raises(RecordNotFound):
+            bench.submissions.create_job(bench.owner, JobSpec(upload_id=upload_id))
+
+
+def test_a_rejected_job_is_recorded_and_never_waits(bench: Any) -> None:
+    spec = JobSpec(upload_id=bench.finished_upload())
+    row = bench.submissions.create_job(bench.owner, spec, rejection=JobError(code="invalid_scan", message="no mesh"))
+    assert bench.state(row.id) == ("rejected", 0)
+    assert bench.records.waiting(10) == []
+    assert bench.records.job(row.id).expires_at == bench.clock.now + 1000
+
+
+def test_pages_show_every_job_once_newest_first(bench: Any) -> None:
+    upload = bench.finished_upload()
+    made = []
+    for number in range(7):
+        bench.clock.now += 1
+        made.append(bench.job(upload_id=upload, label="odd" if number % 2 else "even"))
+    bench.job("somebody else")
+    bench.records.cancel(made[3])
+    seen: list[str] = []
+    cursor = None
+    while True:
+        rows, cursor = bench.submissions.list_jobs(bench.owner, cursor=cursor, limit=3)
+        seen += [row.id for row in rows]
+        if cursor is None:
+            break
+    assert seen == made[::-1]
+
+    def listed(**filters: object) -> list[str]:
+        return [row.id for row in bench.submissions.list_jobs(bench.owner, **filters)[0]]
+
+    assert listed(state=JobState.canceled) == [made[3]]
+    assert listed(label="odd") == made[5::-2]
+    assert listed(label="odd", state=JobState.queued) == [made[5], made[1]]
+    bench.records.delete(made[3])
+    assert made[3] not in listed()
+
+
+def test_an_idempotency_key_makes_one_job(bench: Any) -> None:
+    spec = JobSpec(upload_id=bench.finished_upload())
+    held = bench.submissions.reserve(bench.owner, "key", "body")
+    with pytest.raises(IdempotencyInFlight):
+        bench.submissions.reserve(bench.owner, "key", "body")
+    with pytest.raises(IdempotencyMismatch):
+        bench.submissions.reserve(bench.owner, "key", "other body")
+    assert isinstance(bench.submissions.reserve("somebody else", "key", "other body"), Reservation)
+    job = bench.submissions.create_job(bench.owner, spec, reservation=held)
+    assert bench.submissions.reserve(bench.owner, "key", "body").id == job.id
+    with pytest.raises(IdempotencyMismatch):
+        bench.submissions.reserve(bench.owner, "key", "other body")
+    bench.submissions.release(held)  # too late: the key stays bound
+    assert bench.submissions.reserve(bench.owner, "key", "body").id == job.id
+
+
+def test_a_released_key_is_free(bench: Any) -> None:
+    bench.submissions.release(bench.submissions.reserve(bench.owner, "key", "body"))
+    assert isinstance(bench.submissions.reserve(bench.owner, "key", "other body"), Reservation)
+
+
+def test_a_dead_request_gives_its_key_away_and_makes_no_second_job(bench: Any) -> None:
+    spec = JobSpec(upload_id=bench.finished_upload())
+    slow = bench.submissions.reserve(bench.owner, "key", "body")
+    bench.clock.now += HOLD_SECONDS + 1
+    fast = bench.submissions.reserve(bench.owner, "key", "body")
+    assert isinstance(fast, Reservation)
+    with pytest.raises(IdempotencyInFlight):
+        bench.submissions.create_job(bench.owner, spec, reservation=slow)
+    job = bench.submissions.create_job(bench.owner, spec, reservation=fast)
+    assert [row.id for row in bench.submissions.list_jobs(bench.owner)[0]] == [job.id]
+
+
+def test_many_requests_at_once_make_one_job(bench: Any) -> None:
+    spec = JobSpec(upload_id=bench.finished_upload())
+    barrier = threading.Barrier(8)
+    answers: list[str] = []
+
+    def submit() -> None:
+        barrier.wait()
+        try:
+            held = bench.submissions.reserve(bench.owner, "key", "body")
+        except IdempotencyInFlight:
+            answers.append("in flight")
+            return
+        if isinstance(held, Reservation):
+            held = bench.submissions.create_job(bench.owner, spec, reservation=held)
+        answers.append(held.id)
+
+    threads = [threading.Thread(target=submit) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    (job,) = bench.submissions.list_jobs(bench.owner)[0]
+    assert len(answers) == 8
+    assert set(answers) <= {job.id, "in flight"}
+    assert job.id in answers

@@ -1,0 +1,79 @@
+"""Upload rows and API keys."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from sqlalchemy import text
+
+from advtex_store.errors import IllegalTransition, RecordNotFound
+
+
+def test_an_upload_from_beginning_to_end(bench: Any) -> None:
+    row = bench.uploads.create("me", 10, "scan.zip")
+    bench.uploads.advance(row.id, 4)
+    half = bench.uploads.upload(row.id, "me")
+    assert (half.offset, half.sha256, half.expires_at) == (4, None, bench.clock.now + 86400)
+    bench.clock.now += 5
+    whole = bench.uploads.finish(row.id, "ab" * 32)
+    assert (whole.offset, whole.sha256, whole.expires_at) == (10, "ab" * 32, bench.clock.now + 1000)
+    assert bench.uploads.finish(row.id, "ab" * 32).id == row.id
+    with pytest.raises(IllegalTransition):
+        bench.uploads.finish(row.id, "cd" * 32)
+    with pytest.raises(RecordNotFound):
+        bench.uploads.upload(row.id, "somebody else")
+
+
+def test_a_discarded_upload_is_gone(bench: Any) -> None:
+    row = bench.uploads.create("me", 10)
+    bench.uploads.discard(row.id)
+    bench.uploads.discard(row.id)
+    with pytest.raises(RecordNotFound):
+        bench.uploads.finish(row.id, "ab" * 32)
+
+
+def test_an_upload_with_a_job_stays(bench: Any) -> None:
+    job = bench.job()
+    upload = bench.records.job(job).upload_id
+    with pytest.raises(IllegalTransition, match="delete the job"):
+        bench.uploads.delete(upload, bench.owner)
+    bench.records.cancel(job)
+    bench.records.delete(job)
+    with pytest.raises(RecordNotFound):
+        bench.uploads.delete(upload, "somebody else")
+    bench.uploads.delete(upload, bench.owner)
+    with pytest.raises(RecordNotFound):
+        bench.uploads.upload(upload)
+
+
+def test_keys(bench: Any) -> None:
+    key = bench.accounts.create_key("laptop", scopes=["read"])
+    caller = bench.accounts.authenticate(key)
+    assert key.startswith(f"adv_{caller.key_id}_")
+    assert (caller.owner, caller.scopes) == (caller.key_id, frozenset({"read"}))
+    for wrong in ("", "adv_", key[:-1], key + "x", key[:-1] + ("a" if key[-1] != "a" else "b"), key.upper()):
+        assert bench.accounts.authenticate(wrong) is None
+    bench.accounts.revoke_key(caller.key_id)
+    assert bench.accounts.authenticate(key) is None
+    with pytest.raises(RecordNotFound):
+        bench.accounts.revoke_key("none")
+    with pytest.raises(ValueError, match="the scopes are"):
+        bench.accounts.create_key(scopes=["fly"])
+
+
+def test_keys_expire_and_share_an_owner(bench: Any) -> None:
+    old = bench.accounts.create_key(owner="team", expires_at=bench.clock.now + 10)
+    new = bench.accounts.create_key(owner="team")
+    assert bench.accounts.authenticate(old).owner == "team"
+    bench.clock.now += 10
+    assert bench.accounts.authenticate(old) is None
+    assert bench.accounts.authenticate(new).owner == "team"
+
+
+def test_no_secret_is_stored(bench: Any) -> None:
+    key = bench.accounts.create_key()
+    secret = key.rpartition("_")[2]
+    with bench.database.read() as session:
+        stored = str(session.execute(text("select * from api_keys")).all())
+    assert secret not in stored

@@ -81,7 +81,7 @@ def test_clean_keeps_uv_and_their_seams() -> None:
     assert cleaned.t_pos_idx.tolist() == [[0, 1, 2], [2, 1, 3]]
     assert cleaned.v_uv is not None
     assert cleaned.t_uv_idx is not None
-    assert cleaned.v_uv[cleaned.t_uv_idx].tolist() == mesh.v_uv[mesh.t_uv_idx][1:].tolist()  # type: ignore[index]
+    assert cleaned.v_uv[cleaned.t_uv_idx].tolist() == mesh.v_uv[mesh.t_uv_idx][1:].tolist()
     assert len(cleaned.v_uv) == 6
 
 

@@ -96,7 +96,7 @@ def why_not_kept(mesh: Mesh) -> str | None:
     collapsed = area[uv_area <= 1e-12].sum() / area.sum()
     if collapsed > MAX_COLLAPSED:
         return f"those of {collapsed:.1%} of the surface have no area"
-    counts = _coverage(corners * UV_TEST_SIZE, UV_TEST_SIZE, UV_TEST_SIZE, reach=0.0)
+    counts = texel_coverage(corners * UV_TEST_SIZE, UV_TEST_SIZE, UV_TEST_SIZE, reach=0.0)
     used = (counts > 0).mean()
     overlap = (counts > 1).sum() / max((counts > 0).sum(), 1)
     if overlap > MAX_OVERLAP:
@@ -251,7 +251,7 @@ def covered_texels(atlas: Atlas) -> Tensor:
     2x2 square around its center meets a uv triangle.
     """
     corners = _uv_corners(atlas.mesh) * np.array([atlas.width, atlas.height])
-    return torch.from_numpy(_coverage(corners, atlas.width, atlas.height, reach=1.0) > 0)
+    return torch.from_numpy(texel_coverage(corners, atlas.width, atlas.height, reach=1.0) > 0)
 
 
 def _uv_corners(mesh: Mesh) -> Floats:
@@ -269,7 +269,7 @@ def _uv_areas(corners: Floats) -> Floats:
     return area
 
 
-def _coverage(corners: Floats, width: int, height: int, reach: float) -> npt.NDArray[np.int32]:
+def texel_coverage(corners: Floats, width: int, height: int, reach: float) -> npt.NDArray[np.int32]:
     """[H,W] how many triangles [T,3,2] (texels) meet the square of half-side `reach` around each texel's center.
 
     reach 0 counts centers. For each triangle and row the columns form one interval: an edge with inward normal n

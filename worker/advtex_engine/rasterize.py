@@ -62,8 +62,8 @@ def rasterize_views(
     block = max(1, max_bytes // _ITEM_BYTES)
     if mesh.v_pos.device.type == "cpu":
         block = min(block, _CPU_BLOCK)
-    positions = mesh.v_pos.double().T.contiguous()
-    corners = mesh.t_pos_idx.T.contiguous()
+    positions = _columns(mesh.v_pos, torch.float64, block)
+    corners = _columns(mesh.t_pos_idx, torch.int64, block)
     for camera in cameras:
         points, beyond = _image_points(positions, camera, near, block)
         seen = _in_frustum(beyond, corners, block)
@@ -220,6 +220,15 @@ def _expand(count: Tensor, first: Tensor | None) -> tuple[Tensor, Tensor]:
     if first is not None:
         before += first
     return item, torch.arange(total, device=count.device).add_(before.index_select(0, item))
+
+
+def _columns(table: Tensor, dtype: torch.dtype, block: int) -> Tensor:
+    """[N,3] -> [3,N] contiguous."""
+    columns = torch.empty((3, len(table)), dtype=dtype, device=table.device)
+    for part in _blocks(len(table), block):
+        for axis in range(3):
+            columns[axis, part] = table[part, axis]
+    return columns
 
 
 def _full(size: int, value: int, dtype: torch.dtype, device: torch.device, block: int) -> Tensor:

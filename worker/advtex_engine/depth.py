@@ -135,16 +135,18 @@ def depth_in_color_image(depth: Tensor, depth_camera: Camera, color_camera: Came
     if repeat > 1:
         depth = depth.repeat_interleave(repeat, 0).repeat_interleave(repeat, 1)
         depth_camera = scaled_camera(depth_camera, depth_camera.width * repeat, depth_camera.height * repeat)
-    row, column = torch.nonzero(depth > 0, as_tuple=True)
-    z = depth[row, column].double()
-    pixel = torch.stack([column + 0.5, row + 0.5, torch.ones_like(z)], dim=1)
     to_color = color_camera.world_to_camera @ torch.linalg.inv(depth_camera.world_to_camera)
-    ray = torch.linalg.inv(depth_camera.K).T
-    seen = (pixel @ ray * z[:, None]) @ to_color[:3, :3].T + to_color[:3, 3]
-    x, y = ((seen @ color_camera.K.T)[:, :2] / seen[:, 2:]).unbind(1)
-    inside = (seen[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < color_camera.width) & (y < color_camera.height)
-    index = y[inside].long() * color_camera.width + x[inside].long()
-    nearest = torch.full((color_camera.height * color_camera.width,), torch.inf, dtype=torch.float64)
-    nearest.scatter_reduce_(0, index, seen[inside, 2], "amin")
+    # A reading z at the pixel (u, v) lands at H (u, v, 1) z + h, undivided: two small outer sums per coordinate.
+    H = (color_camera.K @ to_color[:3, :3] @ torch.linalg.inv(depth_camera.K)).tolist()
+    h = (color_camera.K @ to_color[:3, 3]).tolist()
+    u = torch.arange(depth_camera.width) + 0.5
+    v = torch.arange(depth_camera.height)[:, None] + 0.5
+    x, y, z = ((H[k][0] * u + (H[k][1] * v + H[k][2])) * depth + h[k] for k in range(3))
+    column, row = (x / z).floor(), (y / z).floor()
+    inside = (depth > 0) & (z > 0) & (column >= 0) & (row >= 0)
+    inside &= (column < color_camera.width) & (row < color_camera.height)
+    index = (row[inside] * color_camera.width + column[inside]).long()
+    nearest = torch.full((color_camera.height * color_camera.width,), torch.inf)
+    nearest.scatter_reduce_(0, index, z[inside], "amin")
     nearest[nearest.isinf()] = 0
-    return nearest.float().view(color_camera.height, color_camera.width)
+    return nearest.view(color_camera.height, color_camera.width)

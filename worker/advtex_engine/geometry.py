@@ -29,9 +29,9 @@ def clean(mesh: Mesh) -> Mesh:
     """
     position, inverse = _unique_rows(mesh.v_pos.numpy())
     faces = inverse[mesh.t_pos_idx.numpy()]
-    keep = _has_area(position, faces)
-    keep[keep] = _first_of_each(np.sort(faces[keep], axis=1))
-    if not keep.any():
+    keep = np.flatnonzero(_has_area(position, faces))
+    keep = keep[_first_of_each(np.sort(faces[keep], axis=1))]
+    if len(keep) == 0:
         raise ScanError(
             Problem(
                 "mesh_without_area",
@@ -90,7 +90,7 @@ def decimate(mesh: Mesh, face_budget: int, monitor: Monitor) -> Mesh:
 
 def _has_area(position: npt.NDArray[np.float32], faces: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
     corners = position.astype(np.float64)[faces]
-    finite = np.isfinite(corners).all(axis=(1, 2))
+    finite = np.isfinite(corners.reshape(-1, 9)).all(axis=1)
     a, b, c = np.moveaxis(np.where(finite[:, None, None], corners, 0.0), 1, 0)
     double_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     longest = np.maximum.reduce([((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))])

@@ -11,6 +11,7 @@ from fastapi.responses import JSONResponse
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from advtex_contract.errors import ErrorCode, ErrorDetail
 from advtex_server.refusal import ApiError
@@ -65,6 +66,8 @@ def translated(error: Exception) -> ApiError:
             if error.status_code >= 500 and code is ErrorCode.bad_request:
                 code = ErrorCode.internal
             return ApiError(code, str(error.detail), status=error.status_code, headers=error.headers)
+        case ClientDisconnect():
+            return ApiError(ErrorCode.bad_request, "the line broke before the whole body had come")
         case DBAPIError() | PoolTimeoutError():
             return ApiError(ErrorCode.unavailable, "the database cannot be reached at the moment; try again")
         case _:
@@ -84,6 +87,7 @@ def install(app: FastAPI) -> None:
 
     for kind in (
         ApiError,
+        ClientDisconnect,
         store.StoreError,
         RequestValidationError,
         HTTPException,

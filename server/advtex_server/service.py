@@ -188,12 +188,7 @@ class Service:
         ]
         if report.ok:
             return self.store.submissions.create_job(owner, spec, warnings=details, reservation=reservation)
-        count = sum(detail.severity == "error" for detail in details)
-        rejection = JobError(
-            code=ErrorCode.invalid_scan,
-            details=details,
-            message=f"the scan cannot be textured: {count} problem{'s' if count != 1 else ''} found",
-        )
+        rejection = _rejection(details)
         return self.store.submissions.create_job(owner, spec, rejection=rejection, reservation=reservation)
 
     @contextmanager
@@ -209,6 +204,13 @@ class Service:
             path = Path(folder) / "scan.zip"
             blobs.fetch(key, path)
             yield path
+
+
+def _rejection(details: list[ErrorDetail]) -> JobError:
+    errors = [detail for detail in details if detail.severity == "error"]
+    more = f" (and {len(errors) - 1} more problems)" if len(errors) > 1 else ""
+    message = f"the scan cannot be textured: {errors[0].where} {errors[0].message}{more}"
+    return JobError(code=ErrorCode.invalid_scan, message=message, details=details)
 
 
 def job_view(row: JobRow) -> JobView:

@@ -63,14 +63,14 @@ class MeshError(ScanFormatError):
 
 
 class Findings:
-    """Collects findings; those of one severity and code become one line that names the first few places."""
+    """Collects findings; those of one severity, code and remedy become one that names the first few places."""
 
     def __init__(self) -> None:
-        self._groups: dict[tuple[Severity, str], tuple[Finding, list[str]]] = {}
+        self._groups: dict[tuple[Severity, str, str], tuple[Finding, list[str]]] = {}
 
     def add(self, finding: Finding) -> None:
         """Add one finding to its group."""
-        group = self._groups.setdefault((finding.severity, finding.code), (finding, []))
+        group = self._groups.setdefault((finding.severity, finding.code, finding.remedy), (finding, []))
         group[1].append(finding.where)
 
     def extend(self, findings: Iterable[Finding]) -> None:
@@ -92,7 +92,7 @@ class Findings:
 
     def count(self, code: str) -> int:
         """How many findings with this code were added."""
-        return sum(len(places) for (_, known), (_, places) in self._groups.items() if known == code)
+        return sum(len(places) for (_, known, _), (_, places) in self._groups.items() if known == code)
 
     def result(self) -> tuple[Finding, ...]:
         """All groups, errors first, each in the order of its first finding."""

@@ -228,6 +228,13 @@ def test_all_problems_are_reported_at_once(maker, make):
     assert expected <= set(errors(check_scan(maker.folder())))
 
 
+def test_problems_of_one_kind_with_different_remedies_are_told_apart(maker):
+    maker.native()
+    maker.scan |= {"up_axis": "up", "depth_scale": -1}
+    places = [finding.where for finding in check_scan(maker.folder()).findings]
+    assert places == ["scan.json: up_axis", "scan.json: depth_scale"]
+
+
 def test_lost_and_missing_poses_are_dropped_and_counted(maker):
     maker.native(9)
     frame(maker, 0)["camera_to_world"] = [[-math.inf] * 4] * 4

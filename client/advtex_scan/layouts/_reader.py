@@ -70,7 +70,8 @@ class ScanReader:
         values = parse_numbers(text)
         if values is None or len(values) not in counts:
             wanted = " or ".join(map(str, counts))
-            self.findings.error("bad_numbers", name, f"does not hold {wanted} numbers", "write the file again")
+            remedy = f"write {wanted} numbers and nothing else"
+            self.findings.error("bad_numbers", name, f"does not hold {wanted} numbers", remedy)
             return None
         return values
 
@@ -174,6 +175,13 @@ def parse_numbers(text: str) -> list[float] | None:
         return [float(word) for word in re.split(r"[\s,;]+", text.strip()) if word]
     except ValueError:
         return None
+
+
+def parse_size(width: str, height: str) -> tuple[int, int] | None:
+    """An image size from two words; None if they are no positive numbers of at most six digits."""
+    if not all(word.isascii() and word.isdecimal() and len(word) <= 6 and int(word) > 0 for word in (width, height)):
+        return None
+    return int(width), int(height)
 
 
 def parse_settings(text: str) -> dict[str, str]:

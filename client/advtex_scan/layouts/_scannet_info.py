@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from advtex_scan.layouts._reader import ScanReader, parse_numbers, parse_settings
+from advtex_scan.layouts._reader import TEXT_LIMIT, ScanReader, parse_numbers, parse_settings, parse_size
 from advtex_scan.manifest import Matrix4
 from advtex_scan.matrices import invert_rigid, matrix4, pose_problem
 
@@ -27,12 +27,11 @@ class SceneInfo:
 def read_scene_info(reader: ScanReader) -> SceneInfo:
     """The first text file at the top that holds one of MARKS; empty if there is none."""
     for name in reader.archive.names():
-        if "/" in name or not name.endswith(".txt") or name in reader.used:
+        if "/" in name or not name.endswith(".txt") or reader.archive.size(name) > TEXT_LIMIT:
             continue
         settings = parse_settings(reader.text(name) or "")
         if any(mark in settings for mark in MARKS):
-            width, height = settings.get("colorWidth", ""), settings.get("colorHeight", "")
-            size = (int(width), int(height)) if _is_size(width) and _is_size(height) else None
+            size = parse_size(settings.get("colorWidth", ""), settings.get("colorHeight", ""))
             return SceneInfo(size, _depth_to_color(reader, settings.get("colorToDepthExtrinsics"), name))
         reader.used.discard(name)
     return SceneInfo()
@@ -41,10 +40,6 @@ def read_scene_info(reader: ScanReader) -> SceneInfo:
 def documented_meshes(reader: ScanReader) -> tuple[str, ...]:
     """ScanNet's own mesh names: the decimated one before the full one, since a texture needs no more of it."""
     return tuple(name for suffix in MESHES for name in reader.archive.names() if name.endswith(suffix))
-
-
-def _is_size(word: str) -> bool:
-    return word.isascii() and word.isdecimal() and 0 < len(word) <= 6 and int(word) > 0
 
 
 def _depth_to_color(reader: ScanReader, text: str | None, name: str) -> Matrix4 | None:

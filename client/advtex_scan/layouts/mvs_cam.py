@@ -65,7 +65,7 @@ def _frame(
         reader.drop("missing_color", stem, "has no color image; the frame is left out", remedy)
         return None
     if cam is None:
-        reader.drop("missing_pose", stem, "has no .cam; the frame is left out", f"add {stem}.cam")
+        reader.drop("missing_pose", stem, "has no .cam; the frame is left out", "add the image's .cam")
         return None
     lines = (reader.text(cam) or "").strip().splitlines()
     pose = _pose(reader, lines, cam)

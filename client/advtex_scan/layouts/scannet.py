@@ -96,7 +96,7 @@ def _entry(
         reader.drop("missing_color", f"frame {number}", "has no color image; the frame is left out", remedy)
         return None
     if "pose" not in files:
-        remedy = f"add pose/{number}.txt, or remove the frame"
+        remedy = "export the pose too, or remove the frame"
         reader.drop("missing_pose", files["color"], "has no pose; the frame is left out", remedy)
         return None
     pose = reader.pose_file(files["pose"])

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 from advtex_scan.archive import ScanArchive
 from advtex_scan.layouts._mesh_choice import choose_mesh
-from advtex_scan.layouts._reader import Match, ScanReader, parse_numbers, parse_settings
+from advtex_scan.layouts._reader import Match, ScanReader, parse_numbers, parse_settings, parse_size
 from advtex_scan.manifest import IDENTITY, FrameEntry, Intrinsics, Matrix4, ScanManifest
 from advtex_scan.matrices import compose, invert_rigid
 
@@ -91,7 +91,7 @@ def _entry(
         reader.drop("missing_color", name, "has no color image; the frame is left out", remedy)
         return None
     if "pose" not in frame.files:
-        remedy = f"add {name}.pose.txt, or remove the frame"
+        remedy = "add the frame's .pose.txt, or remove the frame"
         reader.drop("missing_pose", name, "has no pose; the frame is left out", remedy)
         return None
     pose = reader.pose_file(frame.files["pose"])
@@ -118,9 +118,8 @@ def _camera(
             return reader.matrix_intrinsics(name, size)
     values = parse_numbers(info.get(f"m_calibration{kind}Intrinsic", ""))
     if values and len(values) == 16:
-        stated = [info.get(f"m_{kind.lower()}{side}", "") for side in ("Width", "Height")]
-        stated_size = (int(stated[0]), int(stated[1])) if all(map(str.isdecimal, stated)) else size
-        return reader.opencv_intrinsics((values[0], values[5], values[2], values[6]), stated_size, INFO_FILE)
+        stated = parse_size(info.get(f"m_{kind.lower()}Width", ""), info.get(f"m_{kind.lower()}Height", ""))
+        return reader.opencv_intrinsics((values[0], values[5], values[2], values[6]), stated or size, INFO_FILE)
     return reader.matrix_intrinsics(COMMON_FILE, size) if COMMON_FILE in reader.archive else None
 
 

@@ -1,6 +1,6 @@
 """Random access into a zip member, stored or deflated, without unpacking it.
 
-`RangeReader` reads byte ranges with `os.pread`, so that threads share no file position. For a deflated member it keeps
+`RangeReader` reads byte ranges at positions, so that threads share none. For a deflated member it keeps
 copies of the decompressor's state: one every `CHECKPOINT_BYTES` of output for good, and the last few positions where a
 read of a large member ended. Reading ranges in order therefore inflates each byte once, and a jump inflates at most
 one checkpoint's distance once that region was passed. A state takes about 50 kB: 10 GB of output keep about 30 MB.
@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import bisect
 import io
-import os
 import threading
 import zlib
 from collections import OrderedDict, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING
 
+from advtex_scan._source import FileSource
 from advtex_scan.errors import ArchiveError, Finding
 
 if TYPE_CHECKING:
@@ -65,8 +65,8 @@ def damaged(name: str, what: str) -> ArchiveError:
 class RangeReader:
     """Reads ranges of the members of one file. Safe to use from several threads at once."""
 
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
+    def __init__(self, source: FileSource) -> None:
+        self._source = source
         self._lock = threading.Lock()
         self._checkpoints: defaultdict[str, list[_State]] = defaultdict(list)
         self._recent: OrderedDict[tuple[str, int], _State] = OrderedDict()
@@ -74,12 +74,12 @@ class RangeReader:
     def read(self, extent: Extent, offset: int, length: int) -> bytes:
         """Return `length` bytes from `offset`; the caller has checked them against the member's size."""
         if not extent.deflated:
-            return _pread(self._file, extent, offset, length)
+            return _stored(self._source, extent, offset, length)
         state = self._nearest(extent.name, offset)
-        for _ in _inflate(self._file, extent, state, offset - state.position):
+        for _ in _inflate(self._source, extent, state, offset - state.position):
             self._keep_checkpoint(extent.name, state)
         pieces = []
-        for piece in _inflate(self._file, extent, state, length):
+        for piece in _inflate(self._source, extent, state, length):
             pieces.append(piece)
             self._keep_checkpoint(extent.name, state)
         if extent.size > CHECKPOINT_BYTES:
@@ -112,9 +112,9 @@ class RangeReader:
 class MemberStream(io.RawIOBase):
     """One pass over a member from its first byte; its length and CRC are checked when the end is reached."""
 
-    def __init__(self, file: BinaryIO, extent: Extent) -> None:
+    def __init__(self, source: FileSource, extent: Extent) -> None:
         super().__init__()
-        self._file = file
+        self._source = source
         self._extent = extent
         self._state = _State()
         self._crc = 0
@@ -127,9 +127,9 @@ class MemberStream(io.RawIOBase):
         position, extent = self._state.position, self._extent
         length = min(len(view), extent.size - position, OUTPUT_CHUNK)
         if extent.deflated:
-            piece = b"".join(_inflate(self._file, extent, self._state, length))
+            piece = b"".join(_inflate(self._source, extent, self._state, length))
         else:
-            piece = _pread(self._file, extent, position, length)
+            piece = _stored(self._source, extent, position, length)
             self._state.position += length
         self._crc = zlib.crc32(piece, self._crc)
         view[:length] = piece
@@ -138,55 +138,51 @@ class MemberStream(io.RawIOBase):
         return length
 
     def _check_end(self) -> None:
-        if self._extent.deflated and _holds_more(self._file, self._extent, self._state):
+        if self._extent.deflated and _holds_more(self._source, self._extent, self._state):
             raise damaged(self._extent.name, f"inflates to more than the {self._extent.size} bytes it claims")
         if self._crc != self._extent.crc:
             raise damaged(self._extent.name, "its checksum is wrong")
 
 
-def _pread(file: BinaryIO, extent: Extent, offset: int, length: int) -> bytes:
-    pieces, start, end = [], extent.start + offset, extent.start + offset + length
-    while start < end:
-        piece = os.pread(file.fileno(), end - start, start)
-        if not piece:
-            raise damaged(extent.name, "the file ends before this member does")
-        pieces.append(piece)
-        start += len(piece)
-    return b"".join(pieces)
+def _stored(source: FileSource, extent: Extent, offset: int, length: int) -> bytes:
+    data = source.read(length, extent.start + offset)
+    if len(data) != length:
+        raise damaged(extent.name, "the file ends before this member does")
+    return data
 
 
-def _next_input(file: BinaryIO, extent: Extent, state: _State) -> bytes:
+def _next_input(source: FileSource, extent: Extent, state: _State) -> bytes:
     """What the inflater left over, else the next stored bytes; empty at the member's end."""
     if state.inflater.unconsumed_tail:
         return state.inflater.unconsumed_tail
-    piece = _pread(file, extent, state.consumed, min(INPUT_CHUNK, extent.stored - state.consumed))
+    piece = _stored(source, extent, state.consumed, min(INPUT_CHUNK, extent.stored - state.consumed))
     state.consumed += len(piece)
     return piece
 
 
-def _inflate(file: BinaryIO, extent: Extent, state: _State, length: int) -> Iterator[bytes]:
+def _inflate(source: FileSource, extent: Extent, state: _State, length: int) -> Iterator[bytes]:
     """Advance `state` by `length` bytes of output, in pieces of at most OUTPUT_CHUNK."""
     while length > 0:
-        source = _next_input(file, extent, state)
+        data = _next_input(source, extent, state)
         try:
-            piece = state.inflater.decompress(source, min(length, OUTPUT_CHUNK))
+            piece = state.inflater.decompress(data, min(length, OUTPUT_CHUNK))
         except zlib.error as error:
             raise damaged(extent.name, f"does not inflate ({error})") from error
         state.position += len(piece)
         length -= len(piece)
         if piece:
             yield piece
-        elif state.inflater.eof or not source:
+        elif state.inflater.eof or not data:
             raise damaged(extent.name, f"inflates to {state.position} bytes, not to the {extent.size} it claims")
 
 
-def _holds_more(file: BinaryIO, extent: Extent, state: _State) -> bool:
+def _holds_more(source: FileSource, extent: Extent, state: _State) -> bool:
     try:
         while not state.inflater.eof:
-            source = _next_input(file, extent, state)
-            if state.inflater.decompress(source, 1):
+            data = _next_input(source, extent, state)
+            if state.inflater.decompress(data, 1):
                 return True
-            if not source:
+            if not data:
                 return False
     except zlib.error as error:
         raise damaged(extent.name, f"does not inflate ({error})") from error

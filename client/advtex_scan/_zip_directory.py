@@ -6,7 +6,6 @@ overlaps of all members are checked here, and `Extent`s with verified bounds are
 
 from __future__ import annotations
 
-import os
 import stat
 import struct
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ from dataclasses import dataclass
 
 from advtex_scan._inflate import Extent, damaged
 from advtex_scan._names import is_junk, is_nested_archive, unsafe_reason
+from advtex_scan._source import FileSource
 from advtex_scan.errors import ArchiveError, Finding, Findings, LimitError, ScanFormatError, UnsafeArchiveError
 
 END = struct.Struct("<4s4H2LH")  # end of central directory
@@ -55,25 +55,24 @@ class _Entry:
     is_folder: bool
 
 
-def read_directory(descriptor: int, label: str, limits: ArchiveLimits) -> dict[str, Extent]:
+def read_directory(source: FileSource, label: str, limits: ArchiveLimits) -> dict[str, Extent]:
     """All files of the zip by name, folders and operating systems' junk left out.
 
     Raises ArchiveError with every problem that was found in the directory.
     """
-    end = os.fstat(descriptor).st_size
-    start, size, count = _find_directory(descriptor, label, end)
+    start, size, count = _find_directory(source, label)
     if count > limits.entries:
         raise too_many_entries(label, limits)
     if size > DIRECTORY_BYTES_PER_ENTRY * limits.entries:
         raise too_many_entries(label, limits)
     problems = Findings()
     entries: list[_Entry] = []
-    for entry in _entries(descriptor, label, start, size):
+    for entry in _entries(source, label, start, size):
         entries.append(entry)
         if len(entries) > limits.entries:
             raise too_many_entries(label, limits)
     _check_entries(entries, limits, problems)
-    extents = _locate(descriptor, start, entries, problems)
+    extents = _locate(source, start, entries, problems)
     raise_errors(problems)
     return extents
 
@@ -102,20 +101,21 @@ def _not_a_zip(label: str, what: str) -> ArchiveError:
     )
 
 
-def _pread(descriptor: int, label: str, length: int, offset: int) -> bytes:
-    data = os.pread(descriptor, length, offset) if offset >= 0 else b""
+def _exactly(source: FileSource, label: str, length: int, offset: int) -> bytes:
+    data = source.read(length, offset) if offset >= 0 else b""
     if len(data) != length:
         raise _not_a_zip(label, "is truncated or no zip: its directory points outside the file")
     return data
 
 
-def _find_directory(descriptor: int, label: str, end: int) -> tuple[int, int, int]:
+def _find_directory(source: FileSource, label: str) -> tuple[int, int, int]:
     """Start, size in bytes and stated number of entries of the central directory."""
+    end = source.size
     tail_start = max(0, end - END.size - U16)
-    tail = os.pread(descriptor, end - tail_start, tail_start)
+    tail = source.read(end - tail_start, tail_start)
     at = tail.rfind(b"PK\x05\x06")
     if at < 0 or at + END.size > len(tail):
-        head = os.pread(descriptor, 4, 0)
+        head = source.read(4, 0)
         what = "is truncated: its end is missing" if head == b"PK\x03\x04" else "is not a zip"
         raise _not_a_zip(label, what)
     _, disk, _, _, count, size, start, comment = END.unpack_from(tail, at)
@@ -123,10 +123,10 @@ def _find_directory(descriptor: int, label: str, end: int) -> tuple[int, int, in
         raise _not_a_zip(label, "is truncated or split over several files")
     position = tail_start + at
     if U16 in (disk, count) or U32 in (size, start):
-        locator = os.pread(descriptor, END64_LOCATOR.size, max(0, position - END64_LOCATOR.size))
+        locator = source.read(END64_LOCATOR.size, max(0, position - END64_LOCATOR.size))
         if locator[:4] == b"PK\x06\x07" and len(locator) == END64_LOCATOR.size:
             position = END64_LOCATOR.unpack(locator)[2]
-            record = END64.unpack(_pread(descriptor, label, END64.size, min(position, end)))
+            record = END64.unpack(_exactly(source, label, END64.size, min(position, end)))
             if record[0] != b"PK\x06\x06":
                 raise _not_a_zip(label, "is damaged: its zip64 directory is missing")
             count, size, start = record[7], record[8], record[9]
@@ -135,8 +135,8 @@ def _find_directory(descriptor: int, label: str, end: int) -> tuple[int, int, in
     return start, size, count
 
 
-def _entries(descriptor: int, label: str, start: int, size: int) -> Iterator[_Entry]:
-    data = _pread(descriptor, label, size, start)
+def _entries(source: FileSource, label: str, start: int, size: int) -> Iterator[_Entry]:
+    data = _exactly(source, label, size, start)
     at = 0
     while at < size:
         if at + ENTRY.size > size or data[at : at + 4] != b"PK\x01\x02":
@@ -215,14 +215,14 @@ def _check_entries(entries: list[_Entry], limits: ArchiveLimits, problems: Findi
         problems.error("archive_too_large", "", message, "split the scan")
 
 
-def _locate(descriptor: int, directory: int, entries: list[_Entry], problems: Findings) -> dict[str, Extent]:
+def _locate(source: FileSource, directory: int, entries: list[_Entry], problems: Findings) -> dict[str, Extent]:
     """Follow each entry to its bytes; they must lie between its own header and the next one."""
     extents: dict[str, Extent] = {}
     ordered = sorted(entries, key=lambda entry: entry.header)
     bounds = [*(entry.header for entry in ordered), directory][1:]
     for entry, bound in zip(ordered, bounds, strict=True):
         shown = repr(entry.name)[1:-1][:200]
-        local = os.pread(descriptor, LOCAL.size, min(entry.header, directory))
+        local = source.read(LOCAL.size, min(entry.header, directory))
         if len(local) != LOCAL.size or local[:4] != b"PK\x03\x04":
             problems.error("damaged_member", shown, "its local header is missing", "make the zip again")
             continue

@@ -20,6 +20,7 @@ from typing import BinaryIO, Self, cast
 
 from advtex_scan._inflate import Extent, MemberStream, RangeReader
 from advtex_scan._names import common_folder, is_junk, is_nested_archive, unsafe_reason
+from advtex_scan._source import FileSource
 from advtex_scan._zip_directory import ArchiveLimits, raise_errors, read_directory, too_many_entries
 from advtex_scan.errors import ArchiveError, Finding, Findings, LimitError
 from advtex_scan.manifest import ByteRange, FileRef
@@ -117,21 +118,21 @@ def open_scan(path: str | os.PathLike[str], limits: ArchiveLimits | None = None)
 
 class _ZipArchive(ScanArchive):
     def __init__(self, path: Path, limits: ArchiveLimits) -> None:
-        self._file = path.open("rb", buffering=0)
+        self._source = FileSource(path)
         try:
-            extents = read_directory(self._file.fileno(), path.name, limits)
+            extents = read_directory(self._source, path.name, limits)
         except BaseException:
             self.close()
             raise
         self._extents: dict[str, Extent] = extents
-        self._reader = RangeReader(self._file)
+        self._reader = RangeReader(self._source)
         super().__init__(path, {name: extent.size for name, extent in extents.items()})
 
     def close(self) -> None:
-        self._file.close()
+        self._source.close()
 
     def _stream(self, name: str) -> io.RawIOBase:
-        return MemberStream(self._file, self._extents[name])
+        return MemberStream(self._source, self._extents[name])
 
     def _range(self, name: str, offset: int, length: int) -> bytes:
         return self._reader.read(self._extents[name], offset, length)

@@ -154,7 +154,10 @@ def _usable(reader: ScanReader, manifest: ScanManifest) -> ScanManifest:
 def _check_mesh(reader: ScanReader, manifest: ScanManifest) -> MeshFacts | None:
     if manifest.mesh is None:
         if not reader.mesh_reported:
-            remedy = "add the scan's reconstruction as mesh.ply, .obj or .glb, in the coordinates of the poses"
+            remedy = (
+                "add the scan's reconstruction as mesh.ply, .obj or .glb, in the coordinates of the poses; "
+                'scan.json names it as "mesh"'
+            )
             reader.findings.error("no_mesh", "", "there is no mesh", remedy)
         return None
     reader.used.add(manifest.mesh.path)

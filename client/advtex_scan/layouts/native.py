@@ -53,21 +53,9 @@ FILE = "scan.json"
 VERSION = 1
 JSON_LIMIT = 16 << 20
 MAX_FRAMES = 100_000
-SCAN_KEYS = frozenset(
-    [
-        "version",
-        "kind",
-        "up_axis",
-        "depth_scale",
-        "color_intrinsics",
-        "depth_intrinsics",
-        "depth_to_color",
-        "mesh",
-        "frames",
-    ]
-)
-FRAME_KEYS = frozenset(["name", "color", "depth", "camera_to_world", "color_intrinsics", "depth_intrinsics"])
 CAMERAS = ("color_intrinsics", "depth_intrinsics")
+SCAN_KEYS = {"version", "kind", "up_axis", "depth_scale", "depth_to_color", "mesh", "frames", *CAMERAS}
+FRAME_KEYS = {"name", "color", "depth", "camera_to_world", *CAMERAS}
 INTRINSICS_KEYS = ("fx", "fy", "cx", "cy", "width", "height")
 Json = Mapping[str, Any]
 
@@ -122,7 +110,7 @@ def _load(reader: ScanReader) -> Json | None:
         reader.findings.error("bad_json", FILE, "does not hold a JSON object", "see the documented layout")
         return None
     if scan.get("version") != VERSION:
-        message = f"states version {scan.get('version')!r}; this program reads version {VERSION}"
+        message = f"states version {str(scan.get('version'))[:20]}; this program reads version {VERSION}"
         reader.findings.error("bad_version", FILE, message, f'write "version": {VERSION}')
         return None
     return scan
@@ -154,7 +142,7 @@ def _frame(reader: ScanReader, frame: Any, index: int, common: Mapping[str, Intr
     return FrameEntry(name, color, depth, pose, color_camera, cameras.get("depth_intrinsics"))
 
 
-def _unknown_keys(reader: ScanReader, value: Json, known: frozenset[str], where: str) -> None:
+def _unknown_keys(reader: ScanReader, value: Json, known: set[str], where: str) -> None:
     unknown = sorted(str(key)[:40] for key in value if key not in known)
     if unknown:
         message = f"has unknown keys, which are ignored: {', '.join(unknown[:5])}"

@@ -1,0 +1,30 @@
+"""Reads at positions of one file, from several threads, on every platform (`os.pread` is missing on Windows)."""
+
+from __future__ import annotations
+
+import os
+import threading
+from pathlib import Path
+
+
+class FileSource:
+    """An open file without a position of its own. Reading after `close` raises ValueError."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("rb", buffering=0)
+        self._lock = threading.Lock()
+        self.size = os.fstat(self._file.fileno()).st_size
+
+    def read(self, length: int, offset: int) -> bytes:
+        """`length` bytes from `offset`, fewer only at the end of the file."""
+        pieces = []
+        with self._lock:
+            self._file.seek(offset)
+            while length > 0 and (piece := self._file.read(length)):
+                pieces.append(piece)
+                length -= len(piece)
+        return b"".join(pieces)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()

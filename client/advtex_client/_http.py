@@ -29,9 +29,8 @@ def base_headers(config: ClientConfig) -> dict[str, str]:
 def build(http: httpx.Client | httpx.AsyncClient, call: Call[Any]) -> httpx.Request:
     if call.body is None:
         return http.build_request(call.method, call.path, json=call.json, params=call.params, headers=call.headers)
-    request = http.build_request(call.method, call.path, headers=call.headers, timeout=UPLOAD_TIMEOUT)
-    request.stream = call.body
-    return request
+    bare = http.build_request(call.method, call.path, headers=call.headers, timeout=UPLOAD_TIMEOUT)
+    return httpx.Request(bare.method, bare.url, headers=bare.headers, stream=call.body, extensions=bare.extensions)
 
 
 def result_url(base: str, file: ResultFile) -> str:

@@ -6,9 +6,12 @@ and returns the job. Both clients drive it.
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any
+
+from pydantic import ValidationError
 
 from advtex_client import _calls as calls
 from advtex_client.errors import ClientError, ConflictError, NotFoundError, ScanRejectedError
@@ -22,8 +25,12 @@ from advtex_scan.check import check_scan
 Steps = Generator[calls.Call[Any], Any, JobView]
 
 
-def ensure_scan(scan: Path) -> None:
-    """The check that the server makes too, before anything is sent. Raises ScanRejectedError with every finding."""
+def ensure_submittable(scan: Path, label: str) -> None:
+    """The checks that the server makes too, before anything is sent. Raises ScanRejectedError with every finding."""
+    try:
+        JobSpec(upload_id="", label=label)
+    except ValidationError as error:
+        raise ClientError(f"label {label!r} cannot be used: {error.errors()[0]['msg']}") from error
     report = check_scan(scan)
     if report.ok:
         return
@@ -46,21 +53,27 @@ def submission(
 ) -> Steps:
     """Go on with a remembered submission, or begin one. With `new`, a job of its own is made in any case."""
     known = memory.load()
-    if new and known.job_id is not None:
-        known = Submission(generation=known.generation + 1, upload_id=known.upload_id)
-    if known.job_id is not None:
+    if known.job_id is not None and not new:
         try:
             job: JobView = yield calls.get_job(known.job_id)
             return job
-        except NotFoundError:  # deleted or expired: a new one is wanted
-            known = Submission(generation=known.generation + 1, upload_id=known.upload_id)
+        except NotFoundError:  # deleted or expired: another one is wanted
+            new = True
+    if new:
+        known = Submission(salt=f"-{secrets.token_hex(8)}", upload_id=known.upload_id)
+        memory.save(known)
     known = yield from _uploaded(memory, known, scan, on_bytes)
     assert known.upload_id is not None
     spec = JobSpec(upload_id=known.upload_id, options=options, label=label)
     try:
         job = yield calls.create_job(spec, memory.idempotency_key(known))
     except ConflictError as error:
-        job = yield from _made_elsewhere(memory, error)
+        if error.error.code is not ErrorCode.idempotency_mismatch:
+            raise
+        raise ClientError(
+            "this scan was submitted before with the same options and label, but from elsewhere or not as remembered "
+            "here; `advtex-client list` shows that job, and --new makes another one"
+        ) from error
     memory.save(known.model_copy(update={"job_id": job.id}))
     return job
 
@@ -84,17 +97,3 @@ def _uploaded(
     known = known.model_copy(update={"upload_id": upload.id})
     memory.save(known)
     return known
-
-
-def _made_elsewhere(memory: SubmissionMemory, error: ConflictError) -> Steps:
-    """Another run of the same submission was faster: its job is ours."""
-    if error.error.code in (ErrorCode.idempotency_mismatch, ErrorCode.idempotency_in_flight):
-        other = memory.load()
-        if other.job_id is not None:
-            job: JobView = yield calls.get_job(other.job_id)
-            return job
-        raise ClientError(
-            "this scan was submitted before with the same options and label, but not by this computer or not as "
-            "remembered here; `advtex-client list` shows that job, and --new makes another one"
-        ) from error
-    raise error

@@ -15,7 +15,7 @@ from anyio.to_thread import run_sync
 from advtex_client import _calls as calls
 from advtex_client._events import OnTrouble, Watch, is_event_stream
 from advtex_client._http import LIMITS, TIMEOUT, base_headers, build, result_url
-from advtex_client._submission import ensure_scan, submission
+from advtex_client._submission import Steps, ensure_submittable, submission
 from advtex_client.config import load_config
 from advtex_client.downloads import Download, OnFileBytes, is_there, target_path
 from advtex_client.errors import ApiError, ClientError
@@ -90,24 +90,27 @@ class AsyncClient:
 
         Raises ScanRejectedError, with every problem found, before anything is sent. `new` makes another job.
         """
-        await run_sync(ensure_scan, scan)
+        await run_sync(ensure_submittable, scan, label)
         options = options or JobOptions()
         with ExitStack() as stack:
             archive = await run_sync(stack.enter_context, packed(scan))
             memory = SubmissionMemory(self.config.url, archive.sha256, options, label)
-            steps = submission(memory, archive, options, label, new=new, on_bytes=on_bytes)
-            try:
-                call = next(steps)
-                while True:
-                    try:
-                        answer = await self._run(call)
-                    except ApiError as error:
-                        call = steps.throw(error)
-                    else:
-                        call = steps.send(answer)
-            except StopIteration as end:
-                job: JobView = end.value
-                return job
+            await run_sync(stack.enter_context, memory.alone())
+            return await self._submit(submission(memory, archive, options, label, new=new, on_bytes=on_bytes))
+
+    async def _submit(self, steps: Steps) -> JobView:
+        try:
+            call = next(steps)
+            while True:
+                try:
+                    answer = await self._run(call)
+                except ApiError as error:
+                    call = steps.throw(error)
+                else:
+                    call = steps.send(answer)
+        except StopIteration as end:
+            job: JobView = end.value
+            return job
 
     async def get_job(self, job_id: str) -> JobView:
         return await self._run(calls.get_job(job_id))
@@ -200,7 +203,7 @@ class AsyncClient:
             if not response.is_success:
                 await response.aread()
             download.begin(response)
-            async for chunk in response.aiter_raw(1 << 18):
+            async for chunk in response.aiter_bytes():
                 download.write(chunk)
                 if on_bytes:
                     on_bytes(file, download.done)

@@ -13,7 +13,7 @@ import httpx
 from advtex_client import _calls as calls
 from advtex_client._events import OnTrouble, Watch, is_event_stream
 from advtex_client._http import LIMITS, TIMEOUT, base_headers, build, result_url
-from advtex_client._submission import ensure_scan, submission
+from advtex_client._submission import Steps, ensure_submittable, submission
 from advtex_client.config import load_config
 from advtex_client.downloads import Download, OnFileBytes, is_there, target_path
 from advtex_client.errors import ApiError, ClientError
@@ -87,23 +87,26 @@ class Client:
 
         Raises ScanRejectedError, with every problem found, before anything is sent. `new` makes another job.
         """
-        ensure_scan(scan)
+        ensure_submittable(scan, label)
         options = options or JobOptions()
         with packed(scan) as archive:
             memory = SubmissionMemory(self.config.url, archive.sha256, options, label)
-            steps = submission(memory, archive, options, label, new=new, on_bytes=on_bytes)
-            try:
-                call = next(steps)
-                while True:
-                    try:
-                        answer = self._run(call)
-                    except ApiError as error:
-                        call = steps.throw(error)
-                    else:
-                        call = steps.send(answer)
-            except StopIteration as end:
-                job: JobView = end.value
-                return job
+            with memory.alone():
+                return self._submit(submission(memory, archive, options, label, new=new, on_bytes=on_bytes))
+
+    def _submit(self, steps: Steps) -> JobView:
+        try:
+            call = next(steps)
+            while True:
+                try:
+                    answer = self._run(call)
+                except ApiError as error:
+                    call = steps.throw(error)
+                else:
+                    call = steps.send(answer)
+        except StopIteration as end:
+            job: JobView = end.value
+            return job
 
     def get_job(self, job_id: str) -> JobView:
         return self._run(calls.get_job(job_id))
@@ -194,7 +197,7 @@ class Client:
             if not response.is_success:
                 response.read()
             download.begin(response)
-            for chunk in response.iter_raw(1 << 18):
+            for chunk in response.iter_bytes():
                 download.write(chunk)
                 if on_bytes:
                     on_bytes(file, download.done)

@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import platformdirs
@@ -15,13 +18,16 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from advtex_contract.options import JobOptions
 
+if sys.platform != "win32":
+    import fcntl
+
 
 class Submission(BaseModel):
-    """How far a submission came. `generation` counts the jobs made on purpose from the same scan and options."""
+    """How far a submission came. `salt` sets a job apart from earlier ones of the same scan and options."""
 
     model_config = ConfigDict(extra="ignore")
 
-    generation: int = 0
+    salt: str = ""
     upload_id: str | None = None
     job_id: str | None = None
 
@@ -35,6 +41,15 @@ class SubmissionMemory:
         ).hexdigest()
         place = hashlib.sha256(f"{server}\n{self._identity}".encode()).hexdigest()[:32]
         self.path = (folder or platformdirs.user_state_path("advtex")) / "submissions" / f"{place}.json"
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Wait for other runs of the same submission on this computer, and keep them waiting."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with self.path.with_suffix(".lock").open("a") as file:
+            if sys.platform != "win32":  # elsewhere the server's idempotency alone prevents a second job
+                fcntl.flock(file, fcntl.LOCK_EX)
+            yield
 
     def load(self) -> Submission:
         """What is remembered; a fresh record when there is nothing, or nothing that can be read."""
@@ -54,4 +69,4 @@ class SubmissionMemory:
 
     def idempotency_key(self, submission: Submission) -> str:
         """The same for every try of the same submission."""
-        return f"{self._identity[:48]}-{submission.generation}"
+        return f"{self._identity[:48]}{submission.salt}"

@@ -36,7 +36,7 @@ def quick(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: b
 
 
 def stepping(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
-    """`config.steps` steps of 20 ms, a checkpoint every 10; the result depends on every step, made once and in order.
+    """`config.steps` steps of 10 ms, a checkpoint every 10; the result depends on every step, made once and in order.
 
     The history in the state tells where each process began.
     """
@@ -49,7 +49,7 @@ def stepping(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume
         if monitor.stop_requested():
             _save(path, state, monitor)
             raise Stopped
-        time.sleep(0.02)
+        time.sleep(0.01)
         state["step"] += 1
         state["chain"] = hashlib.sha256(f"{state['chain']} {state['step']}".encode()).hexdigest()
         if state["step"] % 10 == 0:

@@ -7,7 +7,7 @@ import logging
 import os
 import signal
 import sys
-import time
+import threading
 from types import FrameType
 from typing import Any
 
@@ -34,15 +34,16 @@ class JobWorker(Worker):
     it, its work-horse does not outlive it, and losing Redis in the middle of a job changes nothing.
     """
 
-    def __init__(self, host: Host, connection: Any) -> None:
+    def __init__(self, host: Host, connection: Any, stopping: threading.Event) -> None:
         super().__init__([QUEUE], connection=connection, serializer=JSONSerializer)
         self._host = host
-        self.told_to_stop = False
+        self._stopping = stopping
         self._parent_pid = os.getpid()
 
     def request_stop(self, _signum: int, _frame: FrameType | None) -> None:
         """The horse checkpoints and gives its job back; without one, the worker ends at once. May come repeatedly."""
-        self.told_to_stop = self._stop_requested = True
+        self._stop_requested = True
+        self._stopping.set()
         if self.horse_pid:
             os.kill(self.horse_pid, signal.SIGTERM)
         else:
@@ -77,21 +78,18 @@ class JobWorker(Worker):
 
 
 def work(host: Host) -> None:
-    """Serve the queue until SIGTERM or SIGINT; a Redis that goes away is waited for."""
-    while True:
-        worker = JobWorker(host, connect_redis(host.settings))
+    """Serve the queue until SIGTERM or SIGINT; a Redis that is away is waited for."""
+    stopping = threading.Event()
+    while not stopping.is_set():
         try:
-            worker.work(logging_level="WARNING")
-            if worker.told_to_stop:
-                return
-            log.warning("the connection to Redis broke; connecting again")
+            JobWorker(host, connect_redis(host.settings), stopping).work(logging_level="WARNING")
+            if not stopping.is_set():
+                log.warning("the connection to Redis broke; connecting again")
         except RedisError as error:
             log.warning("Redis cannot be reached; trying again", error=str(error))
-        except StopRequested:
-            return
         try:
-            time.sleep(RECONNECT_SECONDS)
-        except StopRequested:  # the handler of the worker that ended
+            stopping.wait(RECONNECT_SECONDS)
+        except StopRequested:  # the last worker's signal handler
             return
 
 

@@ -1,0 +1,203 @@
+"""The command line: data on stdout, notes on stderr, exit codes that scripts can rely on."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from fake_server import FakeServer, answers, refuses, view
+from typer.testing import CliRunner, Result
+
+from advtex_client import cli
+from advtex_client._display import duration, job_lines, job_table
+from advtex_client.client import Client
+from advtex_contract.errors import ErrorCode, ErrorDetail
+from advtex_contract.jobs import JobError, JobState
+
+
+@pytest.fixture
+def server(monkeypatch: pytest.MonkeyPatch) -> FakeServer:
+    made = FakeServer()
+
+    def connect(url: str | None, api_key: str | None) -> Client:
+        return Client(url or "http://server.test", api_key or "k", transport=made.transport, retries=1)
+
+    monkeypatch.setattr(cli, "Client", connect)
+    return made
+
+
+def run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+
+
+def test_submit_prints_the_id_and_nothing_else(server: FakeServer, scan: Path) -> None:
+    ran = run(
+        "submit", scan, "--preset", "preview", "--size", "320x240", "--holdout", "8", "--seed", "3", "--label", "x"
+    )
+    assert (ran.exit_code, ran.stdout) == (0, "j0\n")
+    options = server.jobs["j0"].options
+    assert (options.preset.value, options.width, options.height, options.holdout, options.seed) == (
+        "preview",
+        320,
+        240,
+        8,
+        3,
+    )
+    assert server.jobs["j0"].label == "x"
+    assert run("submit", scan, "--new").stdout == "j1\n"
+
+
+def test_json_on_every_command(server: FakeServer, scan: Path, tmp_path: Path) -> None:
+    assert json.loads(run("check", scan, "--json").stdout)["ok"] is True
+    assert json.loads(run("submit", scan, "--json").stdout)["id"] == "j0"
+    for command in ("status", "cancel", "retry"):
+        assert json.loads(run(command, "j0", "--json").stdout)["id"] == "j0"
+    server.finish("j0", {"model.obj": b"o"})
+    assert json.loads(run("watch", "j0", "--json").stdout)["state"] == "succeeded"
+    fetched = run("submit", scan, "--json", "-o", tmp_path / "out")
+    assert json.loads(fetched.stdout)["files"] == [str(tmp_path / "out" / "model.obj")]
+    assert json.loads(run("download", "j0", "-o", tmp_path, "--json").stdout) == [str(tmp_path / "model.obj")]
+    assert json.loads(run("delete", "j0", "--json").stdout) == {"id": "j0", "deleted": True}
+
+
+def test_a_bad_scan_is_4_with_every_finding_and_its_remedy(server: FakeServer, scan: Path) -> None:
+    (scan / "mesh.ply").unlink()
+    (scan / "color" / "1.png").write_bytes(b"no image")
+    ran = run("submit", scan)
+    assert ran.exit_code == 4
+    assert "mesh.ply" in ran.stderr
+    assert "color/1.png" in ran.stderr
+    assert " -> " in ran.stderr
+    assert ran.stdout == ""
+    assert server.requests == []
+    assert run("check", scan).exit_code == 4
+    as_json = run("submit", scan, "--json")
+    body = json.loads(as_json.stderr)["error"]
+    assert (body["code"], body["exit_code"]) == ("invalid_scan", 4)
+    assert all(detail["remedy"] for detail in body["details"] if detail["severity"] == "error")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--size", "big"], "give it as WxH"),
+        (["--size", "10x10"], "width"),
+        (["--steps", "0"], "steps"),
+        (["--max-texture-size", "100000"], "max_texture_size"),
+        (["--face-budget", "1"], "face_budget"),
+        (["--preset", "turbo"], "turbo"),
+        (["--label", "two\nlines"], "label"),
+    ],
+)
+def test_options_out_of_bounds_are_2_and_named(
+    server: FakeServer, scan: Path, arguments: list[str], words: str
+) -> None:
+    ran = run("submit", scan, *arguments)
+    assert ran.exit_code == 2
+    assert words in ran.stderr
+    assert server.requests == []
+
+
+def test_no_command_no_file_and_no_server_are_2(scan: Path, tmp_path: Path) -> None:
+    assert run("paint").exit_code == 2
+    assert run("submit", tmp_path / "nowhere").exit_code == 2
+    ran = run("status", "j0")
+    assert ran.exit_code == 2
+    assert "ADVTEX_URL" in ran.stderr
+
+
+@pytest.mark.parametrize(
+    ("fault", "exit_code"),
+    [
+        (answers(401, ErrorCode.unauthorized), 3),
+        (answers(403, ErrorCode.forbidden), 3),
+        (answers(404, ErrorCode.not_found), 2),
+        (answers(409, ErrorCode.conflict), 2),
+        (refuses, 6),
+        (answers(500, ErrorCode.internal), 6),
+        (answers(503), 6),
+        (answers(507, ErrorCode.insufficient_storage), 6),
+    ],
+)
+def test_every_kind_of_error_has_its_exit_code(server: FakeServer, fault: object, exit_code: int) -> None:
+    server.faults = [fault, fault]  # type: ignore[list-item]
+    ran = run("status", "j0")
+    assert ran.exit_code == exit_code
+    assert ran.stderr.startswith("error: ")
+    assert ran.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("state", "exit_code"),
+    [(JobState.failed, 5), (JobState.canceled, 5), (JobState.rejected, 4), (JobState.succeeded, 0)],
+)
+def test_waiting_ends_as_the_job_does(server: FakeServer, state: JobState, exit_code: int) -> None:
+    error = JobError(code="x", message="out of paint", details=[ErrorDetail(message="buy some", remedy="at the shop")])
+    server.jobs["j0"] = view("j0", state, error=None if exit_code == 0 else error)
+    assert run("watch", "j0").exit_code == exit_code
+
+
+def test_a_wait_that_is_too_long_is_7(server: FakeServer) -> None:
+    server.jobs["j0"] = view("j0", JobState.running)
+    ran = run("watch", "j0", "--timeout", "0.05")
+    assert ran.exit_code == 7
+    assert "it goes on" in ran.stderr
+
+
+def test_an_interrupt_is_130(server: FakeServer) -> None:
+    def interrupted(_request: object) -> None:
+        raise KeyboardInterrupt
+
+    server.faults = [interrupted]  # type: ignore[list-item]
+    ran = run("status", "j0")
+    assert ran.exit_code == 130
+    assert "interrupted" in ran.stderr
+
+
+def test_listing(server: FakeServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    jobs = [view("j2", JobState.running, step=5, label="[bold]kitchen[/bold]"), view("j1")]
+    jobs[0].progress.stage, jobs[0].progress.steps = "optimization", 10
+    lines = job_table(jobs).splitlines()
+    assert len(lines) == 3
+    assert lines[1].split() == ["j2", "running", "optimization", "5/10", "2026-01-01", "00:00", "[bold]kitchen[/bold]"]
+
+
+def test_a_job_in_words() -> None:
+    job = view("j0", JobState.failed, step=5, attempt=2, label="kitchen", error=JobError(code="x", message="no paint"))
+    job.progress.stage, job.progress.steps, job.progress.eta_seconds = "optimization", 10, 200.0
+    text = job_lines(job)
+    assert "failed (attempt 2)" in text
+    assert "step 5 of 10, about 3 min 20 s left" in text
+    assert "no paint" in text
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(0.4, "0 s"), (59.4, "59 s"), (60, "1 min 0 s"), (7500, "2 h 5 min")])
+def test_durations(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+def test_the_client_stays_light() -> None:
+    """What `pip install advtex` brings is enough, and nothing heavier is imported even where it is installed."""
+    heavy = [
+        "numpy",
+        "torch",
+        "cv2",
+        "fastapi",
+        "redis",
+        "rq",
+        "sqlalchemy",
+        "obstore",
+        "advtex_store",
+        "advtex_engine",
+    ]
+    code = f"import sys, advtex_client.cli; sys.exit(', '.join(m for m in {heavy} if m in sys.modules) or 0)"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+
+
+def test_the_installed_command_exists() -> None:
+    assert callable(importlib.import_module("advtex_client.cli").main)

@@ -1,0 +1,336 @@
+"""The SDK against a server in memory that misbehaves on order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import anyio
+import httpx
+import pytest
+from fake_server import FakeServer, answers, breaks, refuses, view
+from tiny_scan import write_zip
+
+from advtex_client import (
+    AsyncClient,
+    AuthError,
+    BusyError,
+    Client,
+    ClientError,
+    ConflictError,
+    InvalidRequestError,
+    JobFailedError,
+    NetworkError,
+    NotFoundError,
+    ScanRejectedError,
+    ServerError,
+    WaitTimeoutError,
+)
+from advtex_client._calls import Attempts
+from advtex_contract.errors import ErrorCode
+from advtex_contract.jobs import JobError, JobState
+from advtex_contract.options import JobOptions
+
+URL = "http://server.test"
+
+
+@pytest.fixture
+def server() -> FakeServer:
+    return FakeServer()
+
+
+@pytest.fixture
+def client(server: FakeServer) -> Iterator[Client]:
+    with Client(URL, "adv_key", transport=server.transport) as made:
+        yield made
+
+
+@pytest.mark.parametrize(
+    ("status", "code", "kind"),
+    [
+        (400, ErrorCode.bad_request, InvalidRequestError),
+        (401, ErrorCode.unauthorized, AuthError),
+        (403, ErrorCode.forbidden, AuthError),
+        (404, ErrorCode.not_found, NotFoundError),
+        (409, ErrorCode.conflict, ConflictError),
+        (413, ErrorCode.too_large, InvalidRequestError),
+        (422, ErrorCode.invalid_options, InvalidRequestError),
+        (422, ErrorCode.idempotency_mismatch, ConflictError),
+        (507, ErrorCode.insufficient_storage, BusyError),
+        (500, ErrorCode.internal, ServerError),
+    ],
+)
+def test_every_error_body_becomes_its_exception(
+    server: FakeServer, client: Client, status: int, code: ErrorCode, kind: type[ClientError]
+) -> None:
+    server.faults = [answers(status, code)]
+    with pytest.raises(kind) as caught:
+        client.get_job("j0")
+    assert caught.value.code == code
+    assert len(server.requests) == 1
+
+
+def test_a_proxy_s_page_is_told_apart(server: FakeServer, client: Client) -> None:
+    server.faults = [lambda _: httpx.Response(500, text="<h1>nginx</h1>")]
+    with pytest.raises(ServerError, match="did not answer as advtex"):
+        client.get_job("j0")
+    server.faults = [lambda _: httpx.Response(200, text="<h1>captive portal</h1>")]
+    with pytest.raises(ClientError, match="no JobView"):
+        client.get_job("j0")
+
+
+def test_the_key_travels_in_the_header_only(server: FakeServer, client: Client) -> None:
+    with pytest.raises(NotFoundError):
+        client.get_job("../../admin?x=1")
+    (request,) = server.requests
+    assert request.headers["Authorization"] == "Bearer adv_key"
+    assert request.url.raw_path == b"/v1/jobs/..%2F..%2Fadmin%3Fx%3D1"
+
+
+@pytest.mark.parametrize("fault", [refuses, breaks, answers(502), answers(503), answers(504), answers(429)])
+def test_passing_trouble_is_outlived_where_repeating_is_safe(server: FakeServer, client: Client, fault: object) -> None:
+    server.jobs["j0"] = view("j0")
+    server.faults = [fault] * 3  # type: ignore[list-item]
+    assert client.get_job("j0").id == "j0"
+    assert len(server.requests) == 4
+
+
+def test_a_retry_of_a_job_is_not_repeated_when_its_fate_is_unknown(server: FakeServer, client: Client) -> None:
+    server.jobs["j0"] = view("j0")
+    server.faults = [breaks]
+    with pytest.raises(NetworkError):
+        client.retry_job("j0")
+    assert len(server.requests) == 1
+    server.faults = [refuses, answers(503)]
+    assert client.retry_job("j0").id == "j0", "what was never done may be asked for again"
+
+
+def test_trouble_that_lasts_is_a_network_error_that_names_the_server(server: FakeServer, client: Client) -> None:
+    server.faults = [refuses] * 5
+    with pytest.raises(NetworkError, match=r"no answer from http://server\.test: connection refused"):
+        client.get_job("j0")
+    assert len(server.requests) == 5
+
+
+def test_pauses_grow_are_spread_and_respect_what_the_server_asks() -> None:
+    attempts = Attempts(True, 6)
+    pauses = [attempts.after_error(httpx.ReadError("x")) for _ in range(6)]
+    for number, pause in enumerate(pauses):
+        full = min(15.0, 0.5 * 2**number)
+        assert full / 2 <= pause <= full
+    with pytest.raises(NetworkError):
+        attempts.after_error(httpx.ReadError("x"))
+    asked = Attempts(True, 1).after_response(httpx.Response(503, headers={"Retry-After": "20"}))
+    assert asked == 20.0
+
+
+def test_submit_sends_the_scan_once_and_makes_one_job(server: FakeServer, client: Client, scan: Path) -> None:
+    sent: list[tuple[int, int]] = []
+    job = client.submit(scan, JobOptions(seed=1), label="a", on_bytes=lambda done, total: sent.append((done, total)))
+    assert sent[-1][0] == sent[-1][1] > 0
+    assert client.submit(scan, JobOptions(seed=1), label="a").id == job.id
+    assert len(server.uploads) == len(server.jobs) == 1
+
+
+def test_other_options_or_labels_are_other_jobs_of_one_upload_each(
+    server: FakeServer, client: Client, scan: Path
+) -> None:
+    ids = [client.submit(scan, JobOptions(seed=seed), label=label).id for seed in (0, 1) for label in ("", "b")]
+    assert len(set(ids)) == 4
+
+
+def test_new_makes_another_job_from_the_same_upload(server: FakeServer, client: Client, scan: Path) -> None:
+    first = client.submit(scan)
+    second = client.submit(scan, new=True)
+    assert first.id != second.id
+    assert client.submit(scan).id == second.id
+    assert len(server.uploads) == 1
+
+
+@pytest.mark.parametrize("broken_at", [0, 1])
+def test_a_submission_that_crashed_goes_on(server: FakeServer, scan: Path, broken_at: int) -> None:
+    """A crash after 0: the upload, 1: the request for the job, whose answer never arrived."""
+
+    def handle(request: httpx.Request) -> httpx.Response:
+        if request.url.path == "/v1/jobs":
+            if broken_at == 1:
+                server.handle(request)
+            raise KeyboardInterrupt
+        return server.handle(request)
+
+    with Client(URL, "k", transport=httpx.MockTransport(handle)) as client, pytest.raises(KeyboardInterrupt):
+        client.submit(scan)
+    with Client(URL, "k", transport=server.transport) as client:
+        job = client.submit(scan)
+    assert list(server.jobs) == [job.id]
+    assert len(server.uploads) == 1
+
+
+def test_a_job_that_was_deleted_is_made_again(server: FakeServer, client: Client, scan: Path) -> None:
+    first = client.submit(scan)
+    client.delete_job(first.id)
+    server.uploads.clear()
+    server.jobs["other"] = view("other")
+    assert client.submit(scan).id != first.id
+    assert len(server.uploads) == 1
+
+
+def test_a_submission_that_this_computer_forgot_says_what_to_do(
+    server: FakeServer, client: Client, scan: Path, tmp_path: Path
+) -> None:
+    client.submit(scan)
+    for file in (tmp_path / "state").rglob("*.json"):
+        file.write_text("not json")
+    with pytest.raises(ClientError, match="--new makes another one"):
+        client.submit(scan)
+    assert client.submit(scan, new=True).id == "j1"
+
+
+def test_a_request_that_is_still_being_answered_is_asked_again(server: FakeServer, client: Client, scan: Path) -> None:
+    with Client(URL, "k", transport=server.transport) as client:
+        client.upload(scan)
+    server.faults = []
+    original = server.handle
+    refused = iter([answers(409, ErrorCode.idempotency_in_flight)] * 2)
+
+    def handle(request: httpx.Request) -> httpx.Response:
+        fault = next(refused, None) if request.url.path == "/v1/jobs" else None
+        return fault(request) if fault else original(request)
+
+    with Client(URL, "k", transport=httpx.MockTransport(handle)) as client:
+        assert client.submit(scan).id == "j0"
+
+
+def test_a_bad_scan_is_not_sent(server: FakeServer, client: Client, scan: Path) -> None:
+    (scan / "scan.json").write_text("{")
+    with pytest.raises(ScanRejectedError) as caught:
+        client.submit(scan)
+    assert caught.value.details[0].where == "scan.json"
+    assert server.requests == []
+
+
+def test_a_zip_is_sent_as_it_is(server: FakeServer, client: Client, scan: Path, tmp_path: Path) -> None:
+    archive = write_zip(tmp_path / "my scan.zip", scan)
+    client.submit(archive)
+    (request,) = [request for request in server.requests if request.url.path == "/v1/uploads"]
+    assert request.content == archive.read_bytes()
+    assert request.headers["X-Filename"] == "my%20scan.zip"
+
+
+STEPS = [
+    view("j0", JobState.running, 1),
+    view("j0", JobState.running, 1),
+    view("j0", JobState.running, 2),
+    view("j0", JobState.succeeded, 3),
+]
+
+
+@pytest.mark.parametrize("events", [True, False])
+def test_watching_tells_every_change_once_by_events_or_by_polls(
+    server: FakeServer, client: Client, events: bool
+) -> None:
+    server.jobs["j0"] = view("j0")
+    server.script, server.events = list(STEPS), events
+    seen = [(job.state, job.progress.step) for job in client.watch_job("j0")]
+    assert seen[-3:] == [(JobState.running, 1), (JobState.running, 2), (JobState.succeeded, 3)]
+    assert len(seen) == len(set(seen))
+
+
+def test_trouble_while_watching_is_never_the_job_s(server: FakeServer, client: Client) -> None:
+    server.jobs["j0"] = view("j0")
+    server.script = list(STEPS)
+    server.faults = [refuses, breaks, answers(500), answers(503), answers(429)]
+    trouble: list[str] = []
+    last = [job.state for job in client.watch_job("j0", on_trouble=lambda error: trouble.append(error.code))][-1]
+    assert last is JobState.succeeded
+    assert trouble == ["network", "network", "unavailable", "unavailable", "unavailable"]
+
+
+@pytest.mark.parametrize(("status", "kind"), [(401, AuthError), (404, NotFoundError)])
+def test_watching_ends_when_the_job_is_out_of_reach(
+    server: FakeServer, client: Client, status: int, kind: type[ClientError]
+) -> None:
+    server.faults = [answers(status, ErrorCode.not_found)]
+    with pytest.raises(kind):
+        list(client.watch_job("j0"))
+
+
+def test_watching_gives_up_at_its_timeout_and_says_that_the_job_goes_on(server: FakeServer, client: Client) -> None:
+    server.jobs["j0"] = view("j0", JobState.running)
+    with pytest.raises(WaitTimeoutError, match="it goes on") as caught:
+        list(client.watch_job("j0", timeout=0.05))
+    assert caught.value.job == server.jobs["j0"]
+
+
+def test_a_line_that_stays_dead_is_given_up_in_the_end(
+    server: FakeServer, client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("advtex_client._events.PATIENCE_SECONDS", 0.0)
+    server.faults = [refuses] * 3
+    with pytest.raises(NetworkError, match="the job may go on"):
+        list(client.watch_job("j0"))
+
+
+@pytest.mark.parametrize(
+    ("state", "kind", "words"),
+    [
+        (JobState.failed, JobFailedError, "failed: out of paint"),
+        (JobState.rejected, ScanRejectedError, "rejected: out of paint"),
+        (JobState.canceled, JobFailedError, "goes on from its checkpoint"),
+    ],
+)
+def test_waiting_raises_how_the_job_ended(
+    server: FakeServer, client: Client, state: JobState, kind: type[ClientError], words: str
+) -> None:
+    server.jobs["j0"] = view("j0", state, error=JobError(code="x", message="out of paint"))
+    with pytest.raises(kind, match=words):
+        client.wait_for_job("j0")
+
+
+def test_pages_are_fetched_as_they_are_needed() -> None:
+    asked: list[str | None] = []
+
+    def handle(request: httpx.Request) -> httpx.Response:
+        cursor = request.url.params.get("cursor")
+        asked.append(cursor)
+        number = int(cursor or 0)
+        jobs = [view(f"j{number}").model_dump(mode="json")]
+        return httpx.Response(200, json={"jobs": jobs, "next_cursor": str(number + 1) if number < 2 else None})
+
+    with Client(URL, "k", transport=httpx.MockTransport(handle)) as client:
+        pages = client.list_jobs()
+        assert next(pages).id == "j0"
+        assert asked == [None]
+        assert [job.id for job in pages] == ["j1", "j2"]
+
+
+def test_both_clients_have_the_same_methods() -> None:
+    def public(kind: type) -> set[str]:
+        return {name for name in vars(kind) if not name.startswith("_")}
+
+    assert public(Client) == public(AsyncClient)
+
+
+def test_the_async_client_submits_watches_and_fetches(server: FakeServer, scan: Path, tmp_path: Path) -> None:
+    async def main() -> None:
+        async with AsyncClient(URL, "k", transport=server.transport) as client:
+            server.faults = [answers(503)]
+            job = await client.submit(scan)
+            done = server.finish(job.id, {"model.obj": b"o" * 3_000_000})
+            assert await client.wait_for_job(job.id) == done
+            server.faults = [breaks]
+            (path,) = await client.download_results(done, tmp_path / "out")
+            assert path.read_bytes() == b"o" * 3_000_000
+            assert (await client.submit(scan)).id == job.id
+            await client.delete_job(job.id)
+            with pytest.raises(NotFoundError):
+                await client.get_job(job.id)
+
+    anyio.run(main)
+
+
+def test_the_public_names_are_sorted_and_exist() -> None:
+    import advtex_client
+
+    assert advtex_client.__all__ == sorted(advtex_client.__all__)
+    assert all(hasattr(advtex_client, name) for name in advtex_client.__all__)

@@ -1,0 +1,133 @@
+"""kill -9 in the middle of a job, wherever it may hit: the job goes on from its checkpoint and succeeds, once."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import fake_engines
+import pytest
+from live_service import LiveService, process_tree, wait_until
+
+from advtex_client import Client
+from advtex_contract.jobs import JobState, JobView
+from advtex_contract.options import JobOptions
+from advtex_store import keys
+
+STEPS = 120
+
+
+def begin(service: LiveService, client: Client, scan: Path, steps: int = STEPS) -> tuple[str, list[int]]:
+    """A job in the middle of its work, with a checkpoint stored. -> its id; worker, work-horse and runner."""
+    worker = service.start_worker("stepping")
+    job = client.submit(scan, JobOptions(steps=steps))
+    index = keys.checkpoint_prefix(job.id, 1) + "index.json"
+    wait_until(lambda: service.store.blobs.exists(index) and client.get_job(job.id).progress.step >= 15)
+    tree = process_tree(worker.pid)
+    assert len(tree) == 3
+    return job.id, tree
+
+
+def assert_done_once(service: LiveService, client: Client, job_id: str, steps: int = STEPS) -> dict[str, list[int]]:
+    """Every step counts once in the result, and there is one manifest. -> the engine's own account."""
+    job: JobView = client.wait_for_job(job_id, timeout=60)
+    (result,) = [file for file in job.results if file.name == "model.obj"]
+    manifest = service.store.results.manifest(job_id)
+    text = b"".join(
+        chunk for file in manifest.files if file.name == "model.obj" for chunk in service.store.blobs.stream(file.key)
+    )
+    assert len(text) == result.size
+    state = json.loads(text.decode().split("\n", 1)[1])
+    assert state["step"] == steps
+    assert state["chain"] == fake_engines.chain(steps)
+    assert {file.key.split("/")[3] for file in manifest.files} == {str(manifest.attempt)}
+    return state
+
+
+def test_the_runner_alone(service: LiveService, scan: Path) -> None:
+    with service.client() as client:
+        job_id, (_, _, runner) = begin(service, client, scan)
+        os.kill(runner, signal.SIGKILL)
+        state = assert_done_once(service, client, job_id)
+        assert len(state["began"]) == 2
+        assert state["began"][1] >= 10
+        assert client.get_job(job_id).attempt == 2
+
+
+def test_the_work_horse_alone(service: LiveService, scan: Path) -> None:
+    with service.client() as client:
+        job_id, (_, horse, runner) = begin(service, client, scan)
+        os.kill(horse, signal.SIGKILL)
+        wait_until(lambda: runner not in process_tree(runner), seconds=2.0)
+        state = assert_done_once(service, client, job_id)
+        assert state["began"][1] >= 10
+
+
+def test_the_worker_alone_takes_its_horse_and_runner_with_it(service: LiveService, scan: Path) -> None:
+    with service.client() as client:
+        job_id, tree = begin(service, client, scan)
+        os.kill(tree[0], signal.SIGKILL)
+        wait_until(lambda: not any(process_tree(pid) for pid in tree[1:]), seconds=5.0)
+        assert client.get_job(job_id).state is JobState.preempted, "the horse had time to give its job back"
+        service.start_worker("stepping")
+        state = assert_done_once(service, client, job_id)
+        assert state["began"][1] >= 15
+
+
+def test_the_whole_tree(service: LiveService, scan: Path) -> None:
+    with service.client() as client:
+        job_id, tree = begin(service, client, scan)
+        for pid in tree:
+            os.kill(pid, signal.SIGKILL)
+        service.start_worker("stepping")
+        state = assert_done_once(service, client, job_id)
+        assert state["began"][1] >= 10
+        assert client.get_job(job_id).attempt == 2
+
+
+def test_a_stopped_worker_that_wakes_up_late_commits_nothing(service: LiveService, scan: Path) -> None:
+    """SIGSTOP is what a swapping or suspended machine looks like: the lease runs out, and then it goes on."""
+    with service.client() as client:
+        job_id, tree = begin(service, client, scan)
+        for pid in tree:
+            os.kill(pid, signal.SIGSTOP)
+        service.start_worker("stepping")
+        wait_until(lambda: client.get_job(job_id).attempt == 2)
+        for pid in tree:
+            os.kill(pid, signal.SIGCONT)
+        state = assert_done_once(service, client, job_id)
+        assert len(state["began"]) == 2
+        wait_until(lambda: len(process_tree(tree[0])) == 1, seconds=5.0)  # it waits for the next job
+
+
+@pytest.mark.slow
+def test_again_and_again(service: LiveService, scan: Path) -> None:
+    with service.client() as client:
+        job_id, tree = begin(service, client, scan, steps=250)
+        for attempt in (2, 3, 4):
+            for pid in tree:
+                os.kill(pid, signal.SIGKILL)
+            worker = service.start_worker("stepping")
+            began = client.get_job(job_id).progress.step
+            wait_until(lambda: client.get_job(job_id).progress.step >= began + 15)  # noqa: B023
+            wait_until(lambda: client.get_job(job_id).attempt == attempt)  # noqa: B023
+            tree = process_tree(worker.pid)
+        state = assert_done_once(service, client, job_id, steps=250)
+        assert len(state["began"]) == 4
+
+
+def test_cancel_stops_a_running_job_within_two_seconds_and_retry_goes_on(service: LiveService, scan: Path) -> None:
+    with service.client() as client:
+        job_id, tree = begin(service, client, scan)
+        asked = time.monotonic()
+        client.cancel_job(job_id)
+        wait_until(lambda: client.get_job(job_id).state is JobState.canceled)
+        assert time.monotonic() - asked < 2.0
+        reached = client.get_job(job_id).progress.step
+        wait_until(lambda: len(process_tree(tree[0])) == 1, seconds=5.0)  # horse and runner are gone
+        client.retry_job(job_id)
+        state = assert_done_once(service, client, job_id)
+        assert state["began"][1] >= reached

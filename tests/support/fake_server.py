@@ -1,0 +1,163 @@
+"""The server's API in memory, as an httpx transport, with faults to order."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+
+import httpx
+
+from advtex_contract.errors import ErrorBody, ErrorCode
+from advtex_contract.jobs import JobSpec, JobState, JobView, Progress, ResultFile, UploadView
+
+NOW = datetime(2026, 1, 1, tzinfo=UTC)
+Fault = Callable[[httpx.Request], httpx.Response]
+
+
+class FakeServer:
+    """`transport` serves jobs, uploads and results; `faults` are used up, one per request, before anything else."""
+
+    def __init__(self) -> None:
+        self.uploads: dict[str, UploadView] = {}
+        self.jobs: dict[str, JobView] = {}
+        self.keys: dict[str, tuple[str, str]] = {}
+        self.results: dict[str, bytes] = {}
+        self.requests: list[httpx.Request] = []
+        self.faults: list[Fault] = []
+        self.script: list[JobView] = []
+        self.events = False
+        self.transport = httpx.MockTransport(self.handle)
+
+    def handle(self, request: httpx.Request) -> httpx.Response:
+        body = request.read()
+        self.requests.append(request)
+        if self.faults:
+            return self.faults.pop(0)(request)
+        path = request.url.path
+        if path == "/v1/uploads":
+            return self._upload(request, body)
+        if match := re.fullmatch(r"/v1/uploads/(\w+)", path):
+            upload = self.uploads.get(match[1])
+            return ok(upload) if upload else error(404, ErrorCode.not_found)
+        if path == "/v1/jobs" and request.method == "POST":
+            return self._create(request, body)
+        if match := re.fullmatch(r"/v1/jobs/([\w-]+)(/\w+)?(?:/(.+))?", path):
+            return self._job(request, *match.groups())
+        return error(404, ErrorCode.not_found)
+
+    def count(self, method: str, path: str) -> int:
+        return sum(r.method == method and r.url.path == path for r in self.requests)
+
+    def finish(self, job_id: str, files: dict[str, bytes]) -> JobView:
+        """The job has succeeded with these results."""
+        self.results = files
+        found = [
+            ResultFile(
+                name=name,
+                size=len(data),
+                sha256=hashlib.sha256(data).hexdigest(),
+                content_type="x/y",
+                url=f"/v1/jobs/{job_id}/results/{name}",
+            )
+            for name, data in files.items()
+        ]
+        self.jobs[job_id] = self.jobs[job_id].model_copy(update={"state": JobState.succeeded, "results": found})
+        return self.jobs[job_id]
+
+    def _upload(self, request: httpx.Request, body: bytes) -> httpx.Response:
+        sha256 = hashlib.sha256(body).hexdigest()
+        if sha256 != request.headers["X-Content-SHA256"] or len(body) != int(request.headers["Content-Length"]):
+            return error(400, ErrorCode.checksum_mismatch)
+        name = f"u{len(self.uploads)}"
+        size = len(body)
+        self.uploads[name] = UploadView(
+            id=name, size=size, offset=size, complete=True, sha256=sha256, filename="scan.zip", created_at=NOW
+        )
+        return ok(self.uploads[name], 201)
+
+    def _create(self, request: httpx.Request, body: bytes) -> httpx.Response:
+        key = request.headers["Idempotency-Key"]
+        if key in self.keys:
+            earlier, job_id = self.keys[key]
+            return ok(self.jobs[job_id]) if earlier == body.decode() else error(422, ErrorCode.idempotency_mismatch)
+        spec = JobSpec.model_validate_json(body)
+        job = view(f"j{len(self.jobs)}", upload_id=spec.upload_id, options=spec.options, label=spec.label)
+        self.jobs[job.id] = job
+        self.keys[key] = (body.decode(), job.id)
+        return ok(job, 201)
+
+    def _job(self, request: httpx.Request, job_id: str, action: str | None, name: str | None) -> httpx.Response:
+        if job_id not in self.jobs:
+            return error(404, ErrorCode.not_found)
+        if action == "/results" and name is not None:
+            return self._result(request, name)
+        if action == "/events":
+            return self._events() if self.events else error(404, ErrorCode.not_found)
+        if self.script and request.method == "GET":
+            self.jobs[job_id] = self.script.pop(0)
+        if request.method == "DELETE":
+            del self.jobs[job_id]
+            return httpx.Response(204)
+        return ok(self.jobs[job_id])
+
+    def _events(self) -> httpx.Response:
+        blocks = [f"id: {i}\nevent: job\ndata: {job.model_dump_json()}\n\n" for i, job in enumerate(self.script, 1)]
+        ping = ': ping\n\nid: 9\nevent: state\ndata: {"kind": "state"}\n\n'
+        return httpx.Response(200, headers={"Content-Type": "text/event-stream"}, text=ping + "".join(blocks))
+
+    def _result(self, request: httpx.Request, name: str) -> httpx.Response:
+        data = self.results[name]
+        etag = f'"{hashlib.sha256(data).hexdigest()}"'
+        headers = {"ETag": etag}
+        match = re.fullmatch(r"bytes=(\d+)-", request.headers.get("Range", ""))
+        if match and request.headers.get("If-Range") in (None, etag):
+            start = int(match[1])
+            headers["Content-Range"] = f"bytes {start}-{len(data) - 1}/{len(data)}"
+            return httpx.Response(206, headers=headers, content=data[start:])
+        return httpx.Response(200, headers=headers, content=data)
+
+
+def view(job_id: str, state: JobState = JobState.queued, step: int = 0, **fields: object) -> JobView:
+    values = {"upload_id": "u0", "options": {}, "created_at": NOW, "updated_at": NOW} | fields
+    return JobView.model_validate({"id": job_id, "state": state, "progress": Progress(step=step)} | values)
+
+
+def ok(model: UploadView | JobView, status: int = 200) -> httpx.Response:
+    return httpx.Response(status, json=json.loads(model.model_dump_json()))
+
+
+def error(status: int, code: ErrorCode, headers: dict[str, str] | None = None) -> httpx.Response:
+    body = ErrorBody(code=code, message=f"this is a {code}").model_dump(mode="json")
+    return httpx.Response(status, json=body, headers=headers)
+
+
+def refuses(request: httpx.Request) -> httpx.Response:
+    raise httpx.ConnectError("connection refused", request=request)
+
+
+def breaks(request: httpx.Request) -> httpx.Response:
+    raise httpx.ReadError("connection reset", request=request)
+
+
+def answers(status: int, code: ErrorCode = ErrorCode.unavailable) -> Fault:
+    return lambda _request: error(status, code)
+
+
+class CutOff(httpx.SyncByteStream):
+    """A body that ends before its time, with the loss of the connection."""
+
+    def __init__(self, data: bytes, request: httpx.Request) -> None:
+        self._data = data
+        self._request = request
+
+    def __iter__(self) -> Iterator[bytes]:
+        yield self._data
+        raise httpx.RemoteProtocolError("peer closed connection", request=self._request)
+
+
+def cuts_off(data: bytes) -> Fault:
+    """Answers 200 with `data` and then loses the connection."""
+    return lambda request: httpx.Response(200, stream=CutOff(data, request))

@@ -122,17 +122,19 @@ def compare_to_truth(model: Path, scan: Path) -> dict[str, float]:
     K = np.array(truth["intrinsics_matrix"])
     ours = _load_model(model.read_bytes(), lambda name: (model.parent / name).read_bytes())
     theirs = _load_model(_member(scan, "truth/object.obj"), lambda name: _member(scan, f"truth/{name}"))
-    renders, photos, masks = [], [], []
-    for view in truth["heldout"]:
+
+    def render(view: dict[str, Any]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """The result, the truth, and where both are."""
         world_to_camera = np.linalg.inv(np.array(view["camera_to_world"]))
         camera = Camera(torch.from_numpy(K), torch.from_numpy(world_to_camera), truth["width"], truth["height"])
-        (render, seen), (photo, there) = (
+        (result, seen), (original, there) = (
             render_layers(atlas, texture, camera, supersample=SUPERSAMPLE) for atlas, texture in (ours, theirs)
         )
-        renders.append(render)
-        photos.append(photo)
-        masks.append((seen == 1) & (there == 1))
-    return score_views(renders, photos, masks)
+        return result, original, (seen == 1) & (there == 1)
+
+    with _pool() as pool:
+        renders, originals, masks = zip(*pool.map(render, truth["heldout"]), strict=True)
+        return score_views(renders, originals, masks)
 
 
 def _load_model(obj: bytes, read: Callable[[str], bytes]) -> tuple[Atlas, torch.Tensor]:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import struct
+import subprocess
+import sys
+import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -131,8 +134,6 @@ def test_positions_count_usable_frames_only(scan: Path) -> None:
 
 
 def test_a_zip_gives_the_same_scene(scan: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    import zipfile
-
     path = tmp_path_factory.mktemp("zip") / "scan.zip"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for file in sorted(scan.iterdir()):
@@ -185,11 +186,16 @@ def text_image(scan: Path) -> str:
     return "frame-000002.color.png"
 
 
-def bomb(scan: Path) -> str:
-    header = struct.pack(">IIBBBBB", 15_000, 15_000, 8, 2, 0, 0, 0)
+def png_header(width: int, height: int) -> bytes:
+    """A PNG that claims a size and holds next to nothing."""
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(bytes(1 << 16))), (b"IEND", b"")]
     body = b"".join(struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in chunks)
-    (scan / "frame-000002.color.png").write_bytes(b"\x89PNG\r\n\x1a\n" + body)
+    return b"\x89PNG\r\n\x1a\n" + body
+
+
+def bomb(scan: Path) -> str:
+    (scan / "frame-000002.color.png").write_bytes(png_header(15_000, 15_000))
     return "frame-000002.color.png"
 
 
@@ -351,3 +357,15 @@ def test_ignoring_the_depth_camera_would_show(name: str) -> None:
         both = (rendered > 0) & (depth > 0)
         off.append(float(((rendered - depth).abs()[both] > 0.05).float().mean()))
     assert off[0] < 0.7 * off[1]
+
+
+def test_opencv_refuses_what_claims_to_be_larger_than_any_texture() -> None:
+    """The second line of defense, in a process of its own: OpenCV reads the limit once, when it is loaded."""
+    program = (
+        "import sys, advtex_engine.pipeline, cv2, numpy\n"
+        "try: cv2.imdecode(numpy.frombuffer(sys.stdin.buffer.read(), numpy.uint8), cv2.IMREAD_COLOR)\n"
+        "except cv2.error as error: sys.exit('CV_IO_MAX_IMAGE_PIXELS' not in str(error))\n"
+        "sys.exit(2)"
+    )
+    completed = subprocess.run([sys.executable, "-c", program], input=png_header(30_000, 30_000), check=False)
+    assert completed.returncode == 0

@@ -39,6 +39,9 @@ UNSEEN_DENSITY = 0.05
 PACKING_ROUNDS = 8
 SHRINK_MARGIN = 0.99
 
+# Rows of triangles that texel_coverage holds at a time; each takes about 150 bytes.
+ROWS_AT_A_TIME = 1_000_000
+
 # A scan's own uv are kept if, measured at UV_TEST_SIZE:
 UV_TEST_SIZE = 1024
 MAX_OVERLAP = 0.02  # share of the covered texels that two faces claim
@@ -277,28 +280,39 @@ def texel_coverage(corners: Floats, width: int, height: int, reach: float) -> np
     (separating axes). Intervals are summed as +1 at their start and -1 after their end.
     """
     corners = corners[_uv_areas(corners) > 0]
-    low, high = corners.min(axis=1) - reach, corners.max(axis=1) + reach
-    first = np.clip(np.ceil(low[:, 1] - 0.5), 0, height).astype(np.int64)
-    rows = np.maximum(np.clip(np.ceil(high[:, 1] - 0.5), 0, height).astype(np.int64) - first, 0)
-    triangle = np.repeat(np.arange(len(corners)), rows)
-    row = np.arange(len(triangle)) - np.repeat(np.cumsum(rows) - rows, rows) + np.repeat(first, rows)
-    left, right = low[triangle, 0], high[triangle, 0]
+    first = _pixel_bound(corners[:, :, 1].min(axis=1) - reach, height)
+    rows = np.maximum(_pixel_bound(corners[:, :, 1].max(axis=1) + reach, height) - first, 0)
+    steps = np.zeros((height, width + 1), dtype=np.int32)
+    chunks = np.flatnonzero(np.diff(np.cumsum(rows) // ROWS_AT_A_TIME)) + 1
+    for part in np.split(np.arange(len(corners)), chunks):
+        triangle = np.repeat(part, rows[part])
+        step = np.arange(len(triangle)) - np.repeat(np.cumsum(rows[part]) - rows[part], rows[part])
+        row = step + first[triangle]
+        start, end = (_pixel_bound(bound, width) for bound in _intervals(corners, triangle, row + 0.5, reach))
+        filled = end > start
+        np.add.at(steps, (row[filled], start[filled]), 1)
+        np.add.at(steps, (row[filled], end[filled]), -1)
+    counts: npt.NDArray[np.int32] = steps.cumsum(axis=1, dtype=np.int32)[:, :width]
+    return counts
+
+
+def _intervals(corners: Floats, triangle: Integers, y: Floats, reach: float) -> tuple[Floats, Floats]:
+    """[N] least and greatest x of the square centers at height y that meet each triangle; empty if greatest < least."""
+    left, right = corners[:, :, 0].min(axis=1)[triangle] - reach, corners[:, :, 0].max(axis=1)[triangle] + reach
     turn = np.sign(np.linalg.det(corners[:, 1:] - corners[:, :1]))
     for k in range(3):
         start, edge = corners[:, k], corners[:, (k + 1) % 3] - corners[:, k]
         normal = np.stack([-edge[:, 1], edge[:, 0]], axis=1) * turn[:, None]
         offset = (normal * start).sum(axis=1) - reach * np.abs(normal).sum(axis=1)
-        nx, rest = normal[triangle, 0], offset[triangle] - normal[triangle, 1] * (row + 0.5)
+        nx, rest = normal[triangle, 0], offset[triangle] - normal[triangle, 1] * y
         with np.errstate(divide="ignore", invalid="ignore"):
             bound = rest / nx
         left = np.where(nx > 0, np.maximum(left, bound), left)
         right = np.where(nx < 0, np.minimum(right, bound), right)
         right = np.where((nx == 0) & (rest > 0), -np.inf, right)
-    start_column = np.clip(np.ceil(left - 0.5), 0, width).astype(np.int64)
-    end_column = np.clip(np.ceil(right - 0.5), 0, width).astype(np.int64)
-    filled = end_column > start_column
-    steps = np.zeros((height, width + 1), dtype=np.int32)
-    np.add.at(steps, (row[filled], start_column[filled]), 1)
-    np.add.at(steps, (row[filled], end_column[filled]), -1)
-    counts: npt.NDArray[np.int32] = steps.cumsum(axis=1, dtype=np.int32)[:, :width]
-    return counts
+    return left, right
+
+
+def _pixel_bound(coordinate: Floats, size: int) -> Integers:
+    """The first of `size` texels whose center is at or beyond the coordinate."""
+    return np.clip(np.ceil(coordinate - 0.5), 0, size).astype(np.int64)

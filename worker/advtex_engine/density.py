@@ -9,8 +9,9 @@ from torch import Tensor
 
 from advtex_engine.scene import Camera, Mesh
 
-# Beyond this many cameras an even selection is measured: quantiles over views change little and memory stays bounded.
+# Of more cameras an even selection is measured: quantiles over views change little, and memory stays bounded.
 MAX_CAMERAS = 160
+MAX_MEASUREMENTS = 20_000_000  # cameras x faces
 # Which of the views that see a face counts: nearly the best one, so that a single close pass does not set the size.
 VIEW_QUANTILE = 0.9
 # Visibility is decided on a coarse depth buffer of points: cells of this many pixels, and relative depth tolerance.
@@ -32,7 +33,8 @@ def pixel_density(mesh: Mesh, cameras: Sequence[Camera]) -> Tensor:
     fx * fy * |n . p| / z^3 pixels. Occlusion is approximate: it is tested on a coarse depth buffer that vertices and
     centroids are splatted into, which is enough to size a texture and costs milliseconds per camera.
     """
-    chosen = torch.linspace(0, len(cameras) - 1, min(len(cameras), MAX_CAMERAS)).round().long().tolist()
+    count = min(len(cameras), MAX_CAMERAS, max(1, MAX_MEASUREMENTS // len(mesh.t_pos_idx)))
+    chosen = torch.linspace(0, len(cameras) - 1, count).round().long().tolist()
     corners = mesh.v_pos[mesh.t_pos_idx]
     normal = torch.nn.functional.normalize(
         torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), dim=1

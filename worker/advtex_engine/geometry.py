@@ -21,9 +21,9 @@ DECIMATION_AGGRESSION = 7.0
 def clean(mesh: Mesh) -> Mesh:
     """Remove what no stage can texture; small separate pieces stay.
 
-    Vertices with identical coordinates are merged (uv seams live on in t_uv_idx), then non-finite, degenerate,
-    zero-area and duplicate faces (same vertices in any order: the first one stays) and unreferenced vertices and uv
-    are dropped. The order of the faces that stay is kept.
+    Vertices with identical coordinates are merged, and uv likewise (seams live on in t_uv_idx). Then non-finite,
+    degenerate, zero-area and duplicate faces (same vertices in any order: the first one stays) and unreferenced
+    vertices and uv are dropped. The order of the faces that stay is kept.
 
     Raises ScanError when no face is left.
     """
@@ -43,12 +43,13 @@ def clean(mesh: Mesh) -> Mesh:
     position, faces = _referenced(position, faces[keep])
     if mesh.v_uv is None or mesh.t_uv_idx is None:
         return Mesh(torch.from_numpy(position), torch.from_numpy(faces))
-    uv, uv_faces = _referenced(mesh.v_uv.numpy(), mesh.t_uv_idx.numpy()[keep])
+    uv, uv_inverse = _unique_rows(mesh.v_uv.numpy())
+    uv, uv_faces = _referenced(uv, uv_inverse[mesh.t_uv_idx.numpy()[keep]])
     return Mesh(torch.from_numpy(position), torch.from_numpy(faces), torch.from_numpy(uv), torch.from_numpy(uv_faces))
 
 
 def decimate(mesh: Mesh, face_budget: int, monitor: Monitor) -> Mesh:
-    """At most `face_budget` faces, by quadric edge collapse (Garland & Heckbert 1997); deterministic.
+    """At most `face_budget` faces of a clean mesh, by quadric edge collapse (Garland & Heckbert 1997); deterministic.
 
     A mesh within the budget is returned as it is, uv included. Decimation moves vertices across uv seams, so that uv
     are dropped, which the monitor is told.
@@ -90,7 +91,7 @@ def decimate(mesh: Mesh, face_budget: int, monitor: Monitor) -> Mesh:
 
 def _has_area(position: npt.NDArray[np.float32], faces: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
     corners = position.astype(np.float64)[faces]
-    finite = np.isfinite(corners.reshape(-1, 9)).all(axis=1)
+    finite = np.asarray(np.isfinite(corners).all(axis=(1, 2)))
     a, b, c = np.moveaxis(np.where(finite[:, None, None], corners, 0.0), 1, 0)
     double_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     longest = np.maximum.reduce([((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))])

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -31,10 +32,6 @@ from advtex_scan.check import read_scan
 from advtex_scan.errors import Finding, ScanFormatError
 from advtex_scan.images import MAX_PIXELS, parse_image_header, place
 from advtex_scan.manifest import ByteRange, FileRef, FrameEntry, Intrinsics, Matrix4, ScanManifest
-
-# OpenCV reads this once, when it is loaded: an image that lies about its size is refused before memory is taken.
-os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))
-import cv2
 
 MAX_IMAGE_BYTES = 256 << 20
 DECODERS = 4

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from advtex_contract.errors import ErrorCode
@@ -48,7 +49,8 @@ class AccessMiddleware:
         return caller
 
     def _limited(self, headers: Headers, receive: Receive) -> Receive:
-        too_large = ApiError(ErrorCode.too_large, f"the body is larger than {self.max_body_bytes} bytes")
+        # An HTTPException, because FastAPI turns all others that come up while a body is read into a plain 400.
+        too_large = HTTPException(413, f"the body is larger than {self.max_body_bytes} bytes")
         declared = headers.get("content-length", "0")
         if declared.isdigit() and int(declared) > self.max_body_bytes:
             raise too_large

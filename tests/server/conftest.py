@@ -11,6 +11,7 @@ from typing import Any
 
 import httpx
 import pytest
+import structlog
 import uvicorn
 
 from advtex_server.app import create_app
@@ -73,6 +74,14 @@ class Live:
         self.store.records.claim(job_id, 1, "test")
         self.store.results.commit(job_id, 1, files)
         return job_id
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _plain_logs() -> Iterator[None]:
+    """The default draws tracebacks with all local variables, which takes seconds."""
+    structlog.configure(processors=[structlog.processors.format_exc_info, structlog.processors.KeyValueRenderer()])
+    yield
+    structlog.reset_defaults()
 
 
 @pytest.fixture

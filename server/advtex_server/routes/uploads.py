@@ -33,17 +33,17 @@ async def create_upload(
     request: Request,
     caller: Writer,
     service: TheService,
-    content_length: Annotated[int | None, Header(ge=0)] = None,
     content_digest: Annotated[str | None, Header(description="RFC 9530, `sha-256=:base64:`")] = None,
     x_content_sha256: Annotated[str | None, Header(description="SHA-256 of the body, hexadecimal")] = None,
     x_filename: Annotated[str, Header(max_length=1000, description="percent-encoded")] = "",
 ) -> UploadView:
     """Send a scan as a zip. The answer comes when its bytes are durable."""
-    if content_length is None:
+    length = request.headers.get("content-length", "")
+    if not (length.isascii() and length.isdigit()):
         raise ApiError(ErrorCode.bad_request, "an upload needs a Content-Length", status=411)
     sha256 = announced_sha256(content_digest, x_content_sha256)
     filename = "".join(c for c in unquote(x_filename) if c.isprintable())
-    block = service.incoming(caller.owner, content_length, filename, sha256)
+    block = service.incoming(caller.owner, int(length), filename, sha256)
     incoming = await run_in_threadpool(block.__enter__)
     try:
         buffer = bytearray()

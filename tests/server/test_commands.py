@@ -1,0 +1,249 @@
+"""`advtex-server` as users run it: real processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import psutil
+import pytest
+
+from advtex_server import embedded
+from advtex_server.children import Child
+from advtex_server.embedded import SetupError, only_one, redis_binary, write_private
+
+COMMAND = [sys.executable, "-m", "advtex_server.main"]
+
+# Stands in for the worker: `advtex_worker.main` of this folder is found first.
+FAKE_WORKER = """
+import os, signal, sys, time
+from pathlib import Path
+from advtex_store.settings import StoreSettings
+from advtex_store.store import open_store
+folder = StoreSettings().data_dir
+store = open_store(StoreSettings())
+store.queue.redis.ping()
+def stop(*_):
+    time.sleep(0.3)
+    store.queue.redis.ping()  # still there: it is stopped after the worker
+    with (folder / "stopped").open("a") as file:
+        file.write("stopped")
+    sys.exit(0)
+signal.signal(signal.SIGTERM, stop)
+(folder / "worker.pid").write_text(str(os.getpid()))
+while True:
+    signal.pause()
+"""
+
+
+def until(condition: Callable[[], Any], seconds: float = 20) -> Any:
+    deadline = time.monotonic() + seconds
+    while not (found := condition()):
+        assert time.monotonic() < deadline, "not in time"
+        time.sleep(0.02)
+    return found
+
+
+class Up:
+    """`advtex-server up` on a folder of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.data = folder / "data"
+        package = folder / "fake" / "advtex_worker"
+        package.mkdir(parents=True, exist_ok=True)
+        (package / "__init__.py").write_text("")
+        (package / "main.py").write_text(FAKE_WORKER)
+        path = os.pathsep.join([str(package.parent), *[p for p in sys.path if p]])
+        self.environment = {**os.environ, "PYTHONPATH": path, "ADVTEX_DISK_RESERVE_BYTES": "0"}
+        self.log = (folder / "log").open("a")
+        command = [*COMMAND, "up", "--port", "0", "--data-dir", str(self.data)]
+        self.process = subprocess.Popen(command, env=self.environment, stdout=subprocess.PIPE, stderr=self.log)
+        assert self.process.stdout is not None
+        self.ready = json.loads(self.process.stdout.readline() or "{}")
+        assert self.ready, (folder / "log").read_text()
+        self.client = json.loads((self.data / "client.json").read_text())
+        self.http = httpx.Client(
+            base_url=self.client["url"], timeout=20, headers={"Authorization": f"Bearer {self.client['api_key']}"}
+        )
+
+    def children(self) -> dict[str, psutil.Process]:
+        found = psutil.Process(self.process.pid).children()
+        return {"redis" if "redis-server" in p.name() else "worker": p for p in found}
+
+    def worker_pid(self) -> int:
+        try:
+            return int((self.data / "worker.pid").read_text())
+        except (FileNotFoundError, ValueError):
+            return 0
+
+    def stop(self, number: int = signal.SIGTERM) -> int:
+        self.http.close()
+        self.process.send_signal(number)
+        code = self.process.wait(30)
+        self.close()
+        return code
+
+    def close(self) -> None:
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+        self.log.close()
+
+
+@pytest.fixture
+def up(tmp_path: Path) -> Iterator[Up]:
+    service = Up(tmp_path)
+    yield service
+    if service.process.poll() is None:
+        service.stop()
+
+
+def test_up(up: Up, tmp_path: Path, scan_zip: Path) -> None:
+    """One command: everything runs, is private, is told to clients, and ends in order."""
+    assert up.ready == {"event": "ready", "url": up.client["url"], "data_dir": str(up.data), "pid": up.process.pid}
+    for private in ("client.json", "redis/password"):
+        assert stat.S_IMODE((up.data / private).stat().st_mode) == 0o600
+    assert all(check["ok"] for check in up.http.get("/readyz").json()["checks"].values())
+    until(up.worker_pid)
+    password = (up.data / "redis" / "password").read_text()
+    for child in up.children().values():
+        assert not any(password in argument for argument in child.cmdline())
+
+    upload = up.http.post("/v1/uploads", content=scan_zip.read_bytes()).json()["id"]
+    job = up.http.post("/v1/jobs", json={"upload_id": upload}).json()
+    with up.http.stream("GET", f"/v1/jobs/{job['id']}/events") as response:
+        next(response.iter_lines())
+        children = up.children()
+        assert set(children) == {"redis", "worker"}
+        started = time.monotonic()
+        assert up.stop() == 0
+    assert time.monotonic() - started < 8, "an open stream must not hold the service"
+    assert (up.data / "stopped").read_text() == "stopped"
+    assert not any(child.is_running() for child in children.values())
+
+    again = Up(tmp_path)
+    assert again.client["api_key"] == up.client["api_key"]
+    assert again.http.get(f"/v1/jobs/{job['id']}").json()["state"] == "queued"
+    assert again.stop(signal.SIGINT) == 0
+
+
+def test_children_that_die_are_started_again(up: Up) -> None:
+    first = until(up.worker_pid)
+    os.kill(first, signal.SIGKILL)
+    until(lambda: up.worker_pid() not in (0, first))
+    redis = up.children()["redis"]
+    redis.kill()
+    until(lambda: not redis.is_running())
+    until(lambda: up.http.get("/readyz").json()["checks"]["redis"]["ok"])
+
+
+def test_children_die_with_the_service(up: Up) -> None:
+    until(up.worker_pid)
+    children = up.children()
+    up.process.kill()
+    up.process.wait()
+    up.close()
+    up.http.close()
+    until(lambda: not any(child.is_running() for child in children.values()))
+
+
+def test_a_second_one_on_the_same_folder_is_refused(up: Up, tmp_path: Path) -> None:
+    command = [*COMMAND, "up", "--port", "0", "--data-dir", str(up.data)]
+    second = subprocess.run(command, env=up.environment, capture_output=True, text=True, timeout=30)
+    assert second.returncode == 1
+    assert "already running" in second.stderr
+    assert "Traceback" not in second.stderr
+    port = up.client["url"].rpartition(":")[2]
+    command = [*COMMAND, "up", "--port", port, "--data-dir", str(tmp_path / "other")]
+    third = subprocess.run(command, env=up.environment, capture_output=True, text=True, timeout=30)
+    assert third.returncode == 1
+    assert "choose another --port" in third.stderr
+
+
+def run(data: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
+        "ADVTEX_DATA_DIR": str(data),
+        "ADVTEX_DISK_RESERVE_BYTES": "0",
+        "ADVTEX_REDIS_URL": "redis://127.0.0.1:1/0",
+        "NO_COLOR": "1",
+    }
+    return subprocess.run([*COMMAND, *arguments], env=environment, capture_output=True, text=True, timeout=60)
+
+
+def test_keys_and_doctor(tmp_path: Path) -> None:
+    created = run(tmp_path, "keys", "create", "laptop", "--scope", "read", "--days", "3")
+    key = created.stdout.strip()
+    assert key.startswith("adv_"), created.stderr
+    (row,) = [json.loads(line) for line in run(tmp_path, "keys", "list").stdout.splitlines()]
+    assert (row["name"], row["scopes"], row["revoked_at"]) == ("laptop", ["read"], None)
+    assert abs(row["expires_at"] - row["created_at"] - 3 * 86400) < 60
+    assert run(tmp_path, "keys", "revoke", row["id"]).returncode == 0
+    assert json.loads(run(tmp_path, "keys", "list").stdout)["revoked_at"] is not None
+    assert run(tmp_path, "keys", "revoke", "none").returncode == 1
+    assert run(tmp_path, "keys", "create", "--scope", "fly").returncode == 2
+    doctor = run(tmp_path, "doctor")
+    assert doctor.returncode == 0
+    assert "FAIL redis: Redis does not answer" in doctor.stdout
+    assert run(tmp_path / "empty", "doctor").returncode == 1
+
+
+def test_without_any_redis_the_message_helps(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert os.access(redis_binary(), os.X_OK)
+    monkeypatch.setattr(embedded.importlib.util, "find_spec", lambda _: None)
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(SetupError, match=r"advtex\[embedded\]"):
+        redis_binary()
+
+
+def test_private_files(tmp_path: Path) -> None:
+    path = tmp_path / "secret"
+    path.write_text("old")
+    path.chmod(0o644)
+    write_private(path, "new")
+    assert (path.read_text(), stat.S_IMODE(path.stat().st_mode)) == ("new", 0o600)
+    assert list(tmp_path.iterdir()) == [path]
+    with only_one(tmp_path / "data"), pytest.raises(SetupError), only_one(tmp_path / "data"):
+        pass
+    with only_one(tmp_path / "data"):
+        pass
+
+
+def test_a_child_that_does_not_stop_is_killed_with_its_own_children() -> None:
+    script = "trap '' TERM; sleep 60 & echo; wait; sleep 60"
+    child = Child("stubborn", ["sh", "-c", script], dict(os.environ), stop_seconds=0.3)
+    child.start()
+    assert child.pid is not None
+    process = psutil.Process(child.pid)
+    grandchildren = until(process.children)
+    child.ask_to_stop()
+    child.wait()
+    assert child.pid is None
+    until(lambda: not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in grandchildren))
+
+
+def test_a_child_that_keeps_dying_is_started_ever_more_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [1000.0]
+    child = Child("dying", ["true"], dict(os.environ), stop_seconds=1)
+    child.start()
+    monkeypatch.setattr("advtex_server.children.time.monotonic", lambda: now[0])
+    pauses = []
+    for _ in range(6):
+        assert child._process is not None
+        child._process.wait()
+        dead, begun = child._process, now[0]
+        while child._process is dead:
+            child.watch()
+            now[0] += 0.5
+        pauses.append(now[0] - begun - 0.5)
+    child.wait()
+    assert pauses == [1.0, 2.0, 5.0, 10.0, 30.0, 30.0]

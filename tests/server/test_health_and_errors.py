@@ -1,0 +1,118 @@
+"""Health, metrics, and the one error body."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from advtex_contract.errors import ErrorCode
+from advtex_server.ranges import chosen_range
+from advtex_server.refusal import STATUS
+
+
+def test_every_code_has_a_status() -> None:
+    assert set(STATUS) == set(ErrorCode)
+    assert all(400 <= status < 600 for status in STATUS.values())
+
+
+def test_every_refusal_has_the_one_body(live: Any, is_error: Any) -> None:
+    http = live.http
+    is_error(http.get("/nowhere"), 404, "not_found")
+    is_error(http.get("/v1/nowhere"), 404, "not_found")
+    is_error(http.put("/v1/jobs"), 405, "bad_request")
+    is_error(http.get("/v1/jobs/" + "a" * 65), 422, "bad_request")
+    is_error(http.post("/v1/jobs", json=[]), 422, "bad_request")
+    for header in ("", "Basic x", "Bearer", "Bearer x", "Bearer adv_000000000000_" + "a" * 40):
+        is_error(http.get("/v1/jobs", headers={"Authorization": header}), 401, "unauthorized")
+        is_error(http.get("/v1/nowhere", headers={"Authorization": header}), 401, "unauthorized")
+
+
+def test_bodies_are_small(make_live: Callable[..., Any], is_error: Any) -> None:
+    live = make_live(max_body_bytes=1000)
+    is_error(live.http.post("/v1/jobs", content=b" " * 1001), 413, "too_large")
+    is_error(live.http.post("/v1/jobs", content=iter([b" " * 600] * 2)), 413, "too_large")
+
+
+def test_what_goes_wrong_inside_is_not_told(live: Any, is_error: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise RuntimeError("secret")
+
+    monkeypatch.setattr(live.store.records, "job", broken)
+    assert "secret" not in is_error(live.http.get("/v1/jobs/x"), 500, "internal")
+
+
+def test_health(live: Any, tmp_path: Path) -> None:
+    with live.client(None) as stranger:
+        assert stranger.get("/healthz").json() == {"status": "ok"}
+        ready = stranger.get("/readyz")
+    assert ready.status_code == 200, "without Redis, jobs are accepted and wait"
+    checks = ready.json()["checks"]
+    assert {name for name, check in checks.items() if check["ok"]} == {"database", "blobs", "disk"}
+    assert "jobs are accepted and wait" in checks["redis"]["message"]
+
+
+def test_readyz_says_what_is_wrong(live: Any) -> None:
+    settings = live.settings.model_copy(update={"disk_reserve_bytes": 1 << 60})
+    live.app.state.service.settings = settings
+    live.store.blobs.spool_dir.mkdir(parents=True, exist_ok=True)
+    live.store.blobs.spool_dir.rmdir()
+    live.store.blobs.spool_dir.write_text("in the way")
+    live.store.database.engine.dispose()
+    for suffix in ("", "-wal", "-shm"):
+        (live.settings.data_dir / f"advtex.db{suffix}").write_bytes(b"no database any more" * 100)
+    response = live.http.get("/readyz")
+    assert response.status_code == 503
+    body = response.json()
+    assert body["ready"] is False
+    messages = {name: check["message"] for name, check in body["checks"].items()}
+    assert "cannot be written" in messages["blobs"]
+    assert "database does not answer" in messages["database"]
+    assert messages["disk"]
+    live.store.blobs.spool_dir.unlink()
+    assert "make room" in live.http.get("/readyz").json()["checks"]["disk"]["message"]
+
+
+def test_a_database_that_is_away_is_unavailable(live: Any, is_error: Any) -> None:
+    live.store.database.engine.dispose()
+    for suffix in ("", "-wal", "-shm"):
+        (live.settings.data_dir / f"advtex.db{suffix}").write_bytes(b"no database any more" * 100)
+    response = live.http.get("/v1/jobs")
+    is_error(response, 503, "unavailable")
+    assert response.headers["retry-after"] == "5"
+    is_error(live.http.post("/v1/uploads", content=b"x"), 503, "unavailable")
+
+
+def test_metrics(live: Any) -> None:
+    live.job(live.upload())
+    for number in range(3):
+        live.http.get(f"/v1/jobs/{number}")
+    with live.client(None) as stranger:
+        text = stranger.get("/metrics").text
+    samples = {
+        (sample.name, *sorted(sample.labels.items())): sample.value
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+    assert samples["advtex_jobs", ("state", "rejected")] == 1
+    assert samples["advtex_jobs", ("state", "queued")] == 0
+    missed = ("advtex_http_requests_total", ("method", "GET"), ("route", "/v1/jobs/{job_id}"), ("status", "404"))
+    assert samples[missed] == 3
+    assert samples[("advtex_disk_free_bytes",)] > 0
+
+
+@pytest.mark.parametrize(
+    ("header", "size", "span"),
+    [
+        ("bytes=0-0", 1, (0, 1)),
+        ("bytes=0-", 5, (0, 5)),
+        ("bytes=-5", 3, (0, 3)),
+        ("bytes= 1-2 ", 3, (1, 3)),
+        ("", 3, None),
+    ],
+)
+def test_ranges_by_hand(header: str, size: int, span: tuple[int, int] | None) -> None:
+    assert chosen_range(header, size) == span

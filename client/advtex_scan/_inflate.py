@@ -1,9 +1,9 @@
 """Random access into a zip member, stored or deflated, without unpacking it.
 
-`RangeReader` reads byte ranges at positions, so that threads share none. For a deflated member it keeps
-copies of the decompressor's state: one every `CHECKPOINT_BYTES` of output for good, and the last few positions where a
-read of a large member ended. Reading ranges in order therefore inflates each byte once, and a jump inflates at most
-one checkpoint's distance once that region was passed. A state takes about 50 kB: 10 GB of output keep about 30 MB.
+For a deflated member `RangeReader` keeps copies of the decompressor's state: one every `CHECKPOINT_BYTES` of output for
+good, and the last few where a read of a large member ended. Reading ranges in order therefore inflates each byte once,
+and a jump into a region that was passed before inflates at most one checkpoint's distance. A state takes about 50 kB:
+10 GB of output keep about 30 MB. Kept states are only copied, never advanced, so threads need no lock to inflate.
 """
 
 from __future__ import annotations

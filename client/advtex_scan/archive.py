@@ -19,7 +19,7 @@ from types import TracebackType
 from typing import BinaryIO, Self, cast
 
 from advtex_scan._inflate import Extent, MemberStream, RangeReader
-from advtex_scan._names import common_folder, is_junk, is_nested_archive, unsafe_reason
+from advtex_scan._names import MAX_NAME, common_folder, is_junk, is_nested_archive, unsafe_reason
 from advtex_scan._source import FileSource
 from advtex_scan._zip_directory import ArchiveLimits, raise_errors, read_directory, too_many_entries
 from advtex_scan.errors import ArchiveError, Finding, Findings, LimitError
@@ -186,6 +186,11 @@ def _walk(root: Path, label: str, limits: ArchiveLimits, problems: Findings) -> 
     found: list[tuple[str, int]] = []
     for folder, subfolders, files in os.walk(root, onerror=_unreadable_folder):
         base = Path(folder)
+        if len(base.relative_to(root).as_posix()) > MAX_NAME:
+            shown = repr(base.relative_to(root).as_posix())[1:61] + "..."
+            problems.error("unsafe_name", shown, "is nested too deeply", "use plain relative names")
+            subfolders.clear()
+            continue
         for entry in [*files, *(name for name in subfolders if (base / name).is_symlink())]:
             path = base / entry
             name = path.relative_to(root).as_posix()

@@ -11,7 +11,7 @@ ScanFormatError             the scan cannot be read; `findings` say what, where 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 Severity = Literal["error", "warning", "info"]
@@ -62,16 +62,34 @@ class MeshError(ScanFormatError):
     """A mesh file is broken or of an unsupported kind."""
 
 
+@dataclass(slots=True)
+class _Group:
+    first: Finding
+    places: list[str] = field(default_factory=list)
+    alike: bool = True  # all messages are the first one's
+
+    def joined(self) -> Finding:
+        if len(self.places) == 1:
+            return self.first
+        where = ", ".join(self.places[:NAMED_PLACES])
+        if len(self.places) > NAMED_PLACES:
+            where += f" and {len(self.places) - NAMED_PLACES} more"
+        extent = f"{len(self.places)} in all" if self.alike else f"the first of {len(self.places)}"
+        return replace(self.first, where=where, message=f"{self.first.message} ({extent})")
+
+
 class Findings:
     """Collects findings; those of one severity, code and remedy become one that names the first few places."""
 
     def __init__(self) -> None:
-        self._groups: dict[tuple[Severity, str, str], tuple[Finding, list[str]]] = {}
+        self._groups: dict[tuple[Severity, str, str], _Group] = {}
 
     def add(self, finding: Finding) -> None:
         """Add one finding to its group."""
-        group = self._groups.setdefault((finding.severity, finding.code, finding.remedy), (finding, []))
-        group[1].append(finding.where)
+        key = (finding.severity, finding.code, finding.remedy)
+        group = self._groups.setdefault(key, _Group(finding))
+        group.places.append(finding.where)
+        group.alike &= finding.message == group.first.message
 
     def extend(self, findings: Iterable[Finding]) -> None:
         """Add each of `findings`."""
@@ -92,18 +110,9 @@ class Findings:
 
     def count(self, code: str) -> int:
         """How many findings with this code were added."""
-        return sum(len(places) for (_, known, _), (_, places) in self._groups.items() if known == code)
+        return sum(len(group.places) for (_, known, _), group in self._groups.items() if known == code)
 
     def result(self) -> tuple[Finding, ...]:
         """All groups, errors first, each in the order of its first finding."""
-        grouped = [_joined(first, places) for first, places in self._groups.values()]
-        return tuple(sorted(grouped, key=lambda finding: SEVERITIES.index(finding.severity)))
-
-
-def _joined(first: Finding, places: list[str]) -> Finding:
-    if len(places) == 1:
-        return first
-    named = ", ".join(places[:NAMED_PLACES])
-    more = f" and {len(places) - NAMED_PLACES} more" if len(places) > NAMED_PLACES else ""
-    message = f"{first.message} (first of {len(places)})"
-    return Finding(first.severity, first.code, named + more, message, first.remedy)
+        findings = (group.joined() for group in self._groups.values())
+        return tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))

@@ -226,6 +226,12 @@ def test_folders_refuse_links_that_leave_them(tmp_path):
     assert codes(refused(folder)) == {"link_or_device"}
 
 
+def test_folders_nested_without_end_are_refused(tmp_path):
+    """Names that long are refused before the walk gets deep enough to exhaust the stack."""
+    tmp_path.joinpath("scan", *["d" * 100] * 12).mkdir(parents=True)
+    assert codes(refused(tmp_path / "scan")) == {"unsafe_name"}
+
+
 def test_a_file_replaced_by_a_link_after_opening_is_not_followed(tmp_path):
     folder = tmp_path / "scan"
     folder.mkdir()

@@ -68,7 +68,10 @@ class ScanArchive(ABC):
         if isinstance(ref, ByteRange):
             return self.read_range(name, ref.offset, length)
         with self.open(name) as stream:
-            return stream.read()
+            data = stream.read(length)
+            if len(data) != length or stream.read(1):  # a zip member checks its sum at its end
+                raise _changed(name)
+        return data
 
     def head(self, ref: FileRef, length: int) -> bytes:
         """The first `length` bytes of a file or byte range, fewer if it is shorter."""
@@ -162,8 +165,7 @@ class _FolderArchive(ScanArchive):
             stream.seek(offset)
             data = stream.read(length)
         if len(data) != length:
-            message = "has become shorter while it was read"
-            raise ArchiveError(Finding("error", "truncated_file", name, message, "wait until the scan is written"))
+            raise _changed(name)
         return data
 
     def _open(self, name: str) -> io.FileIO:
@@ -175,6 +177,11 @@ class _FolderArchive(ScanArchive):
         except OSError as error:
             message = f"cannot be read ({error.strerror})"
             raise ArchiveError(Finding("error", "unreadable_file", name, message, "check its permissions")) from error
+
+
+def _changed(name: str) -> ArchiveError:
+    message = "changed its length while it was read"
+    return ArchiveError(Finding("error", "truncated_file", name, message, "wait until the scan is written"))
 
 
 def _leaves(name: str) -> Finding:

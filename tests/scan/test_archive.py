@@ -232,6 +232,17 @@ def test_folders_nested_without_end_are_refused(tmp_path):
     assert codes(refused(tmp_path / "scan")) == {"unsafe_name"}
 
 
+@pytest.mark.parametrize("length", [3, 300])
+def test_a_file_that_changes_its_length_is_an_error(tmp_path, length):
+    (tmp_path / "a.txt").write_bytes(bytes(100))
+    with open_scan(tmp_path) as archive:
+        (tmp_path / "a.txt").write_bytes(bytes(length))
+        with pytest.raises(ArchiveError, match="changed its length"):
+            archive.read("a.txt")
+    with open_scan(tmp_path) as archive:
+        assert archive.read("a.txt") == bytes(length)
+
+
 def test_a_file_replaced_by_a_link_after_opening_is_not_followed(tmp_path):
     folder = tmp_path / "scan"
     folder.mkdir()

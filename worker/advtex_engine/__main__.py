@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import signal
 import sys
@@ -76,6 +77,7 @@ def _parser() -> argparse.ArgumentParser:
     texture.add_argument("--max-texture-size", type=int, default=TextureConfig.max_texture_size)
     texture.add_argument("--device", default="auto")
     texture.add_argument("--seed", type=int, default=0)
+    texture.add_argument("--checkpoint-seconds", type=float, default=TextureConfig.checkpoint_seconds)
     texture.add_argument("--resume", action="store_true", help="go on from the checkpoint in OUT/work")
     synthesize = commands.add_parser("synthesize", help="make a scan with known truth")
     synthesize.add_argument("out", type=Path, help="folder, or file.zip")
@@ -112,7 +114,7 @@ def main(argv: list[str] | None = None) -> int:
 def _texture(arguments: argparse.Namespace) -> int:
     from advtex_engine.pipeline import texture_scan
 
-    names = ("preset", "method", "size", "holdout", "steps", "face_budget", "max_texture_size", "device", "seed")
+    names = {option.name for option in dataclasses.fields(TextureConfig)} & vars(arguments).keys()
     config = TextureConfig(**{name: getattr(arguments, name) for name in names})
     out: Path = arguments.out
     result = texture_scan(arguments.scan, out, config, work=out / "work", resume=arguments.resume, monitor=_Terminal())

@@ -53,7 +53,7 @@ class WorkFolder:
 
 
 class CheckpointTimer:
-    """Says when the next checkpoint is due: every `seconds`, rarer when writing takes more than MAX_SHARE of the time."""
+    """When the next checkpoint is due: every `seconds`, rarer when writing takes more than MAX_SHARE of the time."""
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds

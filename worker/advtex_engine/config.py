@@ -30,7 +30,7 @@ class Preset:
     lr_discriminator  1e-4, Adam
     beta1             0.5
     l1_weight         lambda = 10 at the start
-    l1_decay          lambda is multiplied by this `l1_decays` times over the whole run (paper: 0.8 every 1,000 of 50,000)
+    l1_decay          lambda is multiplied by this `l1_decays` times over the run (paper: 0.8 every 1,000 of 50,000)
     max_pair_angle    largest angle between the optical axes of a pair, degrees (released code: 15)
     min_pair_overlap  least share of the source's foreground that the auxiliary view sees
     """
@@ -99,4 +99,4 @@ class TextureConfig:
         if self.face_budget < 100:
             raise OptionError(f"face budget {self.face_budget} is out of bounds; at least 100 faces are needed")
         if not 256 <= self.max_texture_size <= 16384:
-            raise OptionError(f"max texture size {self.max_texture_size} is out of bounds; it takes 256 to 16384 texels")
+            raise OptionError(f"max texture size {self.max_texture_size} is out of bounds; 256 to 16384 texels fit")

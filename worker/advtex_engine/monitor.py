@@ -7,7 +7,17 @@ from pathlib import Path
 
 from advtex_engine.errors import Problem
 
-STAGES = ("ingest", "geometry", "atlas", "view_maps", "initial_texture", "optimization", "dilation", "export", "previews")
+STAGES = (
+    "ingest",
+    "geometry",
+    "atlas",
+    "view_maps",
+    "initial_texture",
+    "optimization",
+    "dilation",
+    "export",
+    "previews",
+)
 
 
 class Monitor:

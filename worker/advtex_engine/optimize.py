@@ -3,10 +3,10 @@
 One step: draw a source view A and an auxiliary view B; warp B into A (real); render the texture at A (fake); let the
 discriminator judge [I_A, real - I_A] and [I_A, fake - I_A]; update both players from the same forward passes.
 
-Colors are in [-1, 1]. Pixels that B does not see carry a zero residual in the real and in the fake example alike, so that
-the discriminator cannot tell them apart by their holes. All draws come from one generator on the device, and nothing in
-`step` waits for the device: the crop's size is fixed and only its offset is drawn, a skipped discriminator update is a
-flag that Adam's kernel reads. On a CPU, where a branch costs nothing, the skipped gradient is not computed at all.
+Colors are in [-1, 1]. Pixels that B does not see carry a zero residual in the real and in the fake example alike, so
+that the discriminator cannot tell them apart by their holes. All draws come from one generator on the device, and
+nothing in `step` waits for the device: the crop's size is fixed and only its offset is drawn, a skipped discriminator
+update is a flag that Adam's kernel reads. On a CPU, where a branch costs nothing, the skipped gradient is not computed.
 """
 
 from __future__ import annotations
@@ -41,12 +41,22 @@ class Batch:
     weights: Tensor
 
 
+@dataclass(frozen=True)
+class Losses:
+    """0-dim tensors: both players' losses, the L1 term, and 1 where the discriminator is ahead."""
+
+    discriminator: Tensor
+    adversarial: Tensor
+    l1: Tensor
+    ahead: Tensor
+
+
 def native_bfloat16(device: torch.device) -> bool:
     """Whether bf16 arithmetic is done by the processor and not emulated (emulation is four times slower than fp32)."""
     if device.type == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
+        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
     probe = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
-    return device.type == "cpu" and probe is not None and bool(probe())
+    return bool(device.type == "cpu" and probe is not None and probe())
 
 
 def crop_size(width: int, height: int) -> tuple[int, int]:
@@ -132,33 +142,48 @@ class AdversarialOptimizer:
         )
 
     def step(self) -> None:
-        """Draws a pair and updates the texture, and the discriminator unless it is ahead (its loss <= the texture's)."""
-        batch = self.draw()
+        """Draws a pair, updates the texture, and the discriminator unless it is ahead (its loss <= the texture's)."""
+        losses = self.play(self.draw())
+        gradient = self.texture_gradient(losses)
+        self.update_discriminator(losses)
+        self.update_texture(gradient)
+        self._sums += torch.stack((losses.discriminator, losses.adversarial, losses.l1, losses.ahead)).detach()
+        self._summed += 1
+        self.index += 1
+
+    def play(self, batch: Batch) -> Losses:
+        """Renders the fake example and lets the discriminator judge both; one fake forward pass serves both players."""
         masks = patch_masks(batch.foreground, batch.visible)
         fake = self._image(sample_texels(self.values, batch.slots, batch.weights))
         with self._autocast():
             fake_logits = self.discriminator(batch.condition, (fake - batch.condition) * batch.visible).float()
             real_logits = self.discriminator(batch.condition, (batch.real - batch.condition) * batch.visible).float()
-        loss_discriminator = discriminator_loss(real_logits, fake_logits, masks.discriminator)
+        of_discriminator = discriminator_loss(real_logits, fake_logits, masks.discriminator)
         adversarial = adversarial_loss(fake_logits, masks.texture)
-        l1 = l1_loss(fake, batch.real, batch.visible)
-        (gradient,) = torch.autograd.grad(adversarial + self.l1_weight * l1, [self.values], retain_graph=True)
-        ahead = (loss_discriminator <= adversarial).to(torch.float32).detach()
-        self._update_discriminator(loss_discriminator, ahead)
+        ahead = (of_discriminator <= adversarial).to(torch.float32).detach()
+        return Losses(of_discriminator, adversarial, l1_loss(fake, batch.real, batch.visible), ahead)
+
+    def texture_gradient(self, losses: Losses) -> Tensor:
+        """Gradient [slots,3] of the texture's loss; keeps the graph, which the discriminator's gradient needs too."""
+        loss = losses.adversarial + self.l1_weight * losses.l1
+        (gradient,) = torch.autograd.grad(loss, [self.values], retain_graph=True)
+        return gradient
+
+    def update_texture(self, gradient: Tensor) -> None:
+        """One step of Adam over the compact texture."""
         self.values.grad = gradient
         self.adam_texture.step()
-        self._sums += torch.stack((loss_discriminator.detach(), adversarial.detach(), l1.detach(), ahead))
-        self._summed += 1
-        self.index += 1
 
-    def _update_discriminator(self, loss: Tensor, ahead: Tensor) -> None:
-        if self.device.type == "cpu" and bool(ahead):
+    def update_discriminator(self, losses: Losses) -> None:
+        """One step of Adam over the discriminator, unless it is ahead."""
+        if self.device.type == "cpu" and bool(losses.ahead):
             return
-        for parameter, gradient in zip(self.parameters, torch.autograd.grad(loss, self.parameters), strict=True):
-            # The fused CPU kernel reads a channels_last gradient as if it were contiguous.
+        gradients = torch.autograd.grad(losses.discriminator, self.parameters)
+        for parameter, gradient in zip(self.parameters, gradients, strict=True):
+            # The fused CPU kernel ignores strides: a channels_last gradient would be taken for a contiguous one.
             parameter.grad = gradient.contiguous()
         if self.device.type != "cpu":
-            self.adam_discriminator.found_inf = ahead  # type: ignore[attr-defined]  # the fused kernel's skip flag
+            self.adam_discriminator.found_inf = losses.ahead  # type: ignore[attr-defined]  # the fused kernel's skip flag
         self.adam_discriminator.step()
 
     def drain_losses(self) -> dict[str, float]:

@@ -126,7 +126,7 @@ def write_previews(out: Path, scene: Scene, atlas: Atlas, texture: Tensor, avera
     rows = [[render_view(atlas, candidate, view.camera) for candidate in (texture, average)] for view in views]
     comparison, sheet = folder / "comparison.png", folder / "sheet.png"
     middle = len(views) // 2
-    side_by_side(views[middle], *rows[middle], comparison)
+    side_by_side(views[middle], rows[middle][0], rows[middle][1], comparison)
     contact_sheet(views, rows, ("advtex", "plain average"), sheet)
     return comparison, sheet
 

@@ -62,7 +62,7 @@ class _SampleTexels(torch.autograd.Function):
     def backward(ctx: Any, *grads: Any) -> tuple[Tensor, None, None]:
         slots, weights = ctx.saved_tensors
         (grad,) = grads
-        # embedding_bag's own backward sorts the indices (ten times slower on a CPU) and adds a gradient for the weights.
+        # embedding_bag's own backward sorts the indices (ten times slower on a CPU) and has a gradient for weights.
         spread = (grad[:, None, :] * weights[:, :, None]).flatten(0, 1)
         dense = torch.zeros((ctx.rows, grad.shape[1]), dtype=grad.dtype, device=grad.device)
         # On a CPU index_add_ takes seven times as long with int32 indices.

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -48,8 +48,15 @@ class ViewMaps:
 
     def to(self, device: torch.device) -> ViewMaps:
         """The same maps on another device."""
-        moved = (self.color, self.uv, self.depth, self.intrinsics, self.world_to_camera, self.slot_map)
-        return ViewMaps(*(tensor.to(device) for tensor in moved), self.slots, self.width, self.height)
+        return replace(
+            self,
+            color=self.color.to(device),
+            uv=self.uv.to(device),
+            depth=self.depth.to(device),
+            intrinsics=self.intrinsics.to(device),
+            world_to_camera=self.world_to_camera.to(device),
+            slot_map=self.slot_map.to(device),
+        )
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,6 @@ def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     device = given.maps[1].color.device
     # Weights are drawn on the CPU, so that a run starts from the same discriminator on every device.
     discriminator = PatchDiscriminator(torch.Generator().manual_seed(given.config.seed)).to(device)
-    discriminator = discriminator.to(memory_format=torch.channels_last)
     generator = torch.Generator(device).manual_seed(given.config.seed)
     saved = given.work.load(CHECKPOINT)
     run = _Run(saved["level"], saved["step"], saved["losses"]) if saved else _Run(0, 0, [])

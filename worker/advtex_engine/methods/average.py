@@ -34,7 +34,7 @@ def average_texture(maps: ViewMaps) -> Tensor:
 
 
 def dense_texture(maps: ViewMaps, values: Tensor) -> Tensor:
-    """Compact values [slots,3] as a dense texture [H,W,3], the texels that no view touches filled from their neighbors."""
+    """Compact values [slots,3] as a dense texture [H,W,3]; texels that no view touches are filled from others."""
     known = maps.slot_map >= 0
     texture = torch.zeros((*maps.slot_map.shape, 3), dtype=values.dtype, device=values.device)
     texture[known] = values

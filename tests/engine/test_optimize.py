@@ -1,0 +1,149 @@
+"""The step: what it changes and what not, the same result after a resume, losses against autograd on plain twins."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+
+import pytest
+import torch
+
+from advtex_engine.config import PRESETS
+from advtex_engine.discriminator import PatchDiscriminator
+from advtex_engine.losses import adversarial_loss, discriminator_loss, l1_loss, patch_masks
+from advtex_engine.optimize import AdversarialOptimizer, crop_size
+from advtex_engine.planar import planar_views
+from advtex_engine.texture import bilinear_footprint, decode_uv
+
+WIDTH, HEIGHT = 96, 72
+PRESET = dataclasses.replace(PRESETS["standard"], l1_decays=4)
+
+
+def optimizer(seed: int = 0, steps: int = 20) -> AdversarialOptimizer:
+    maps, pairs = planar_views(4, WIDTH, HEIGHT, 1.2, torch.device("cpu"))
+    start = torch.rand(maps.slots, 3, generator=torch.Generator().manual_seed(5)) * 2 - 1
+    network = PatchDiscriminator(torch.Generator().manual_seed(seed))
+    generator = torch.Generator().manual_seed(seed)
+    return AdversarialOptimizer(
+        maps, pairs, start, PRESET, kind="scene", steps=steps, generator=generator, discriminator=network
+    )
+
+
+def state(of: AdversarialOptimizer) -> list[torch.Tensor]:
+    return [of.values.detach().clone(), *(p.detach().clone() for p in of.parameters)]
+
+
+def test_a_run_that_is_saved_and_loaded_ends_bit_identical() -> None:
+    whole = optimizer()
+    for _ in range(8):
+        whole.step()
+    first = optimizer()
+    for _ in range(3):
+        first.step()
+    file = io.BytesIO()
+    torch.save(first.state_dict(), file)
+    file.seek(0)
+    second = optimizer(seed=9)
+    second.load_state_dict(torch.load(file, weights_only=True))
+    for _ in range(5):
+        second.step()
+    assert second.index == whole.index == 8
+    assert all(torch.equal(a, b) for a, b in zip(state(whole), state(second), strict=True))
+
+
+def test_a_batch_is_what_its_crop_shows() -> None:
+    of = optimizer()
+    batch = of.draw()
+    width, height = of.crop
+    assert (width, height) == crop_size(WIDTH, HEIGHT)
+    assert batch.condition.shape == batch.real.shape == (1, 3, height, width)
+    # All cameras are the same, so the crop of some view is the condition, at one offset, and uv follows it.
+    views = of.maps.color.view(-1, HEIGHT, WIDTH, 3).float() / 127.5 - 1
+    found = [
+        (top, left)
+        for top in range(HEIGHT - height + 1)
+        for left in range(WIDTH - width + 1)
+        for view in views
+        if torch.equal(view[top : top + height, left : left + width].permute(2, 0, 1), batch.condition[0])
+    ]
+    assert len(found) == 1
+    top, left = found[0]
+    uv = decode_uv(of.maps.uv[0]).view(HEIGHT, WIDTH, 2)[top : top + height, left : left + width].reshape(-1, 2)
+    rows, columns = of.maps.slot_map.shape
+    texels, weights = bilinear_footprint(uv * torch.tensor([columns, rows]), columns, rows)
+    assert torch.equal(of.maps.slot_map.flatten()[texels], batch.slots)
+    visible = batch.visible.flatten()
+    torch.testing.assert_close(batch.weights, weights * visible[:, None])
+    assert visible.mean() > 0.9
+
+
+def test_one_step_is_adam_on_the_printed_losses() -> None:
+    """Against torch's plain (not fused) Adam and plain autograd over a dense image, without the compact sampling."""
+    of = optimizer()
+    twin_network = PatchDiscriminator(torch.Generator().manual_seed(0))
+    values = of.values.detach().clone().requires_grad_(True)
+    adam_texture = torch.optim.Adam([values], lr=1e-3, betas=(0.5, 0.999), foreach=False)
+    adam_network = torch.optim.Adam(twin_network.parameters(), lr=1e-4, betas=(0.5, 0.999), foreach=False)
+    for _ in range(3):
+        random_state = of.generator.get_state()
+        batch = of.draw()
+        of.generator.set_state(random_state)
+        weight = of.l1_weight
+        of.step()
+
+        width, height = of.crop
+        fake = (values[batch.slots.long()] * batch.weights[..., None]).sum(1)
+        fake = fake.view(1, height, width, 3).permute(0, 3, 1, 2)
+        masks = patch_masks(batch.foreground, batch.visible)
+        fake_logits = twin_network(batch.condition, (fake - batch.condition) * batch.visible)
+        real_logits = twin_network(batch.condition, (batch.real - batch.condition) * batch.visible)
+        adversarial = adversarial_loss(fake_logits, masks.texture)
+        loss = adversarial + weight * l1_loss(fake, batch.real, batch.visible)
+        of_network = discriminator_loss(real_logits, fake_logits, masks.discriminator)
+        values.grad = torch.autograd.grad(loss, [values], retain_graph=True)[0]
+        adam_network.zero_grad()
+        of_network.backward(inputs=list(twin_network.parameters()))
+        assert of_network > adversarial, "an untrained discriminator is not ahead"
+        adam_texture.step()
+        adam_network.step()
+    # The first Adam steps are lr * sign(gradient): where a gradient is nearly zero, rounding may turn its sign.
+    assert ((of.values - values).abs() > 1e-4).float().mean() < 2e-3
+    for ours, theirs in zip(of.parameters, twin_network.parameters(), strict=True):
+        assert ((ours - theirs).abs() > 2e-5).float().mean() < 1e-2
+
+
+def test_the_discriminator_rests_while_it_is_ahead() -> None:
+    of = optimizer()
+    losses = of.play(of.draw())
+    before = state(of)
+    of.update_discriminator(dataclasses.replace(losses, ahead=torch.tensor(1.0)))
+    assert all(torch.equal(a, b) for a, b in zip(before, state(of), strict=True))
+    of.update_discriminator(dataclasses.replace(losses, ahead=torch.tensor(0.0)))
+    assert any(not torch.equal(a, b) for a, b in zip(before[1:], state(of)[1:], strict=True))
+
+
+def test_lambda_falls_in_equal_periods_over_the_run() -> None:
+    of = optimizer(steps=20)
+    weights = []
+    for index in range(20):
+        of.index = index
+        weights.append(of.l1_weight)
+    assert weights == pytest.approx([10 * 0.8 ** (index // 5) for index in range(20)])
+
+
+def test_losses_are_means_since_the_last_call() -> None:
+    of = optimizer()
+    assert of.drain_losses() == {}
+    of.step()
+    of.step()
+    first = of.drain_losses()
+    assert set(first) == {"discriminator", "adversarial", "l1", "skipped"}
+    assert first["discriminator"] == pytest.approx(2 * 0.693, abs=0.05)
+    assert of.drain_losses() == {}
+
+
+@pytest.mark.parametrize(("width", "height"), [(640, 480), (320, 240), (160, 120), (128, 128), (96, 72)])
+def test_the_crop_moves_by_about_a_tenth_and_keeps_the_patch_grid(width: int, height: int) -> None:
+    crop = crop_size(width, height)
+    assert (width - crop[0]) % 8 == (height - crop[1]) % 8 == 0
+    assert 0.05 <= (width - crop[0]) / width <= 0.15

@@ -1,0 +1,223 @@
+"""The whole engine on a small synthesized scan: files, report, stop and resume, kill and resume, bad options."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+import torch
+
+from advtex_engine.config import PRESETS, TextureConfig
+from advtex_engine.errors import OptionError, Problem, ScanError, Stopped
+from advtex_engine.monitor import STAGES, Monitor
+from advtex_engine.pipeline import choose_device, resolve_preset, texture_scan
+from advtex_engine.synthesize import synthesize
+
+STEPS = 24
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scan") / "scan.zip"
+    synthesize(path, views=12, width=96, height=72)
+    return path
+
+
+CONFIG = TextureConfig(preset="standard", steps=STEPS, holdout=6, face_budget=4000, device="cpu")
+
+
+class Recorder(Monitor):
+    def __init__(self, stop_at: int | None = None) -> None:
+        self.stop_at, self.step = stop_at, 0
+        self.stages: list[str] = []
+        self.steps: list[int] = []
+        self.files: set[str] = set()
+        self.problems: list[Problem] = []
+
+    def stage_finished(self, stage: str, seconds: float, peak_memory_bytes: int) -> None:
+        assert seconds >= 0
+        assert peak_memory_bytes > 2**20
+        self.stages.append(stage)
+
+    def progress(self, step: int, steps: int, losses: Mapping[str, float]) -> None:
+        assert steps == STEPS
+        self.steps.append(step)
+        self.step = step
+
+    def warning(self, problem: Problem) -> None:
+        self.problems.append(problem)
+
+    def checkpointed(self, files: tuple[Path, ...]) -> None:
+        assert all(file.exists() for file in files)
+        self.files |= {file.name for file in files}
+
+    def stop_requested(self) -> bool:
+        return self.stop_at is not None and self.step >= self.stop_at
+
+
+@pytest.fixture(scope="module")
+def whole(scan: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Recorder]:
+    out = tmp_path_factory.mktemp("whole")
+    recorder = Recorder()
+    result = texture_scan(scan, out, CONFIG, work=out / "work", monitor=recorder)
+    assert all(path.exists() for path in result.files)
+    return out, recorder
+
+
+def test_a_run_leaves_models_previews_and_a_report(whole: tuple[Path, Recorder]) -> None:
+    out, recorder = whole
+    assert tuple(recorder.stages) == STAGES
+    assert recorder.steps == list(range(1, STEPS + 1))
+    for name in ("model.obj", "model.mtl", "model.png", "model.glb", "previews/comparison.png", "previews/sheet.png"):
+        assert (out / name).stat().st_size > 50, name
+    report = json.loads((out / "report.json").read_text())
+    assert [stage["stage"] for stage in report["stages"]] == list(STAGES)
+    assert report["losses"][-1]["step"] == STEPS
+    assert report["scan"]["heldout"] == sorted(report["scan"]["heldout"])
+    assert len(report["scan"]["heldout"]) == 2
+    assert report["scan"]["views"] == 10
+    assert set(report["heldout"]) == {"texture", "average"}
+    assert report["options"]["steps"] == STEPS
+    assert report["versions"]["torch"].startswith("2.")
+
+
+def test_a_stopped_run_resumes_to_the_same_bytes_without_redoing_earlier_stages(
+    scan: Path, whole: tuple[Path, Recorder], tmp_path: Path
+) -> None:
+    with pytest.raises(Stopped, match="step 10 of 24"):
+        texture_scan(scan, tmp_path, CONFIG, work=tmp_path / "work", monitor=Recorder(stop_at=10))
+    again = Recorder()
+    texture_scan(scan, tmp_path, CONFIG, work=tmp_path / "work", resume=True, monitor=again)
+    assert again.steps[0] == 11
+    assert "ingest" not in again.stages
+    assert "atlas" not in again.stages
+    assert (tmp_path / "model.png").read_bytes() == (whole[0] / "model.png").read_bytes()
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert [stage["stage"] for stage in report["stages"] if stage["resumed"]] == ["ingest", "geometry", "atlas"]
+    assert [point["step"] for point in report["losses"]] == list(range(1, STEPS + 1))
+
+
+def test_without_resume_and_with_other_options_the_work_folder_is_not_used(
+    scan: Path, whole: tuple[Path, Recorder], tmp_path: Path
+) -> None:
+    with pytest.raises(Stopped):
+        texture_scan(scan, tmp_path, CONFIG, work=tmp_path / "work", monitor=Recorder(stop_at=5))
+    other = TextureConfig(preset="standard", steps=STEPS, holdout=6, face_budget=3000, device="cpu")
+    recorder = Recorder(stop_at=1)
+    with pytest.raises(Stopped, match="step 1 of"):
+        texture_scan(scan, tmp_path, other, work=tmp_path / "work", resume=True, monitor=recorder)
+    assert "atlas" in recorder.stages
+
+
+@pytest.mark.slow
+def test_a_killed_run_resumes_bit_identical(scan: Path, tmp_path: Path) -> None:
+    arguments = [sys.executable, "-m", "advtex_engine", "texture", str(scan), "--preset", "standard", "--steps", "60"]
+    arguments += ["--face-budget", "4000", "--device", "cpu"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "2"}
+    subprocess.run([*arguments, "-o", str(tmp_path / "whole")], check=True, env=environment, capture_output=True)
+    killed = tmp_path / "killed"
+    child = subprocess.Popen(
+        [*arguments, "-o", str(killed), "--checkpoint-seconds", "0.2"],
+        env=environment,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert child.stderr is not None
+    for line in child.stderr:
+        if "step 30/" in line:
+            child.send_signal(signal.SIGKILL)
+            break
+    assert child.wait() == -signal.SIGKILL
+    child.stderr.close()
+    assert not (killed / "model.obj").exists()
+    second = subprocess.run(
+        [*arguments, "-o", str(killed), "--resume"], check=True, env=environment, capture_output=True, text=True
+    )
+    assert "step 1/" not in second.stderr
+    assert (killed / "model.png").read_bytes() == (tmp_path / "whole" / "model.png").read_bytes()
+
+
+@pytest.mark.slow
+def test_a_terminated_run_leaves_a_checkpoint_and_its_exit_code_says_so(scan: Path, tmp_path: Path) -> None:
+    arguments = [
+        sys.executable,
+        "-m",
+        "advtex_engine",
+        "texture",
+        str(scan),
+        "-o",
+        str(tmp_path),
+        "--preset",
+        "standard",
+    ]
+    child = subprocess.Popen([*arguments, "--face-budget", "4000"], stderr=subprocess.PIPE, text=True)
+    assert child.stderr is not None
+    for line in child.stderr:
+        if "step " in line:
+            child.terminate()
+            break
+    started = time.monotonic()
+    _, errors = child.communicate(timeout=30)
+    assert child.returncode == 130
+    assert "resume goes on from there" in errors
+    assert time.monotonic() - started < 10
+    assert (tmp_path / "work" / "checkpoint.pt").exists()
+
+
+def test_the_pyramid_starts_small_and_ends_at_full_size(scan: Path, tmp_path: Path) -> None:
+    config = TextureConfig(preset="preview", steps=STEPS, face_budget=4000, device="cpu")
+    recorder = Recorder()
+    result = texture_scan(scan, tmp_path, config, work=tmp_path / "work", monitor=recorder)
+    assert {"view_maps_1.pt", "view_maps_2.pt"} <= recorder.files
+    levels = result.report["preset"]["levels"]
+    assert sum(level["steps"] for level in levels) == STEPS
+    assert [level["scale"] for level in levels] == [2, 1]
+    assert recorder.steps[-1] == STEPS
+
+
+def test_the_average_method_takes_no_steps(scan: Path, tmp_path: Path) -> None:
+    config = TextureConfig(method="average", face_budget=4000, device="cpu")
+    result = texture_scan(scan, tmp_path, config, work=tmp_path / "work", monitor=Recorder())
+    assert result.report["losses"] == []
+    assert (tmp_path / "model.glb").exists()
+
+
+def test_auto_is_standard_on_a_cpu_and_full_on_a_gpu() -> None:
+    assert resolve_preset(TextureConfig(), torch.device("cpu")) == PRESETS["standard"]
+    assert resolve_preset(TextureConfig(), torch.device("cuda")) == PRESETS["full"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"preset": "best"}, "preset 'best' is unknown"),
+        ({"method": "magic"}, "method 'magic' is unknown"),
+        ({"size": (8, 8)}, "64 to 4096"),
+        ({"holdout": 1}, "holdout 1"),
+        ({"steps": 0}, "steps 0"),
+        ({"face_budget": 3}, "at least 100"),
+        ({"max_texture_size": 100_000}, "256 to 16384"),
+    ],
+)
+def test_options_out_of_bounds_are_named_with_their_bounds(options: dict[str, object], message: str) -> None:
+    with pytest.raises(OptionError, match=message):
+        TextureConfig(**options)  # type: ignore[arg-type]
+
+
+def test_a_device_that_is_not_there_is_named() -> None:
+    with pytest.raises(OptionError, match="'cuda:77' is not available here"):
+        choose_device("cuda:77")
+
+
+def test_a_file_that_is_no_scan_is_refused_with_a_remedy(tmp_path: Path) -> None:
+    path = tmp_path / "scan.zip"
+    path.write_bytes(b"not a zip")
+    with pytest.raises(ScanError, match=r"scan\.zip"):
+        texture_scan(path, tmp_path / "out", CONFIG, work=tmp_path / "work")

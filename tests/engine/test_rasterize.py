@@ -275,15 +275,20 @@ def test_what_is_nearer_than_the_near_plane_is_seen_through() -> None:
     assert (fragments.depth >= 1.2).all()
 
 
-def test_edges_and_corners_on_pixel_centers_leave_no_hole_and_go_to_the_lowest_face() -> None:
-    mesh = grid(8, 6)
-    v_pos = mesh.v_pos + torch.tensor([0.0, 0.0, 1.0])  # one pixel per square: all corners are pixel centres
-    K = torch.tensor([[1.0, 0, 4.5], [0, 1, 3.5], [0, 0, 1]], dtype=torch.float64)
+@pytest.mark.parametrize(("focal", "z"), [(1.0, 1.0), (0.1, 0.1), (0.1, 1.0), (0.7, 3.0), (1 / 3, 7.0)])
+def test_edges_and_corners_on_pixel_centers_leave_no_hole_and_go_to_the_lowest_face(focal: float, z: float) -> None:
+    squares = grid(8, 6)
+    K = torch.tensor([[focal, 0, 4.5], [0, focal, 3.5], [0, 0, 1]], dtype=torch.float64)
     camera = Camera(K, torch.eye(4, dtype=torch.float64), 9, 7)
-    fragments = rasterize(Mesh(v_pos, mesh.t_pos_idx), camera)
-    at_corner = [(mesh.t_pos_idx == vertex).any(1).nonzero()[0].item() for vertex in range(len(v_pos))]
-    assert fragments.face_index.flatten().tolist() == at_corner
-    assert (fragments.depth == 1).all()
+    v_pos = (squares.v_pos.double() * (z / focal)).float() + torch.tensor([0.0, 0.0, z])  # one pixel per square
+    fragments = rasterize(Mesh(v_pos, squares.t_pos_idx), camera)
+    within = (slice(1, -1), slice(1, -1))  # the rim itself may be rounded outwards or inwards in float32
+    assert (fragments.face_index[within] >= 0).all()
+    assert (fragments.barycentric >= 0).all()
+    assert torch.allclose(fragments.depth[within], torch.tensor(z), rtol=1e-7)
+    if (v_pos[:, :2].double() * focal / v_pos[:, 2:] - squares.v_pos[:, :2]).abs().max() < 1e-12:
+        at_corner = [(squares.t_pos_idx == vertex).any(1).nonzero()[0].item() for vertex in range(len(v_pos))]
+        assert fragments.face_index.flatten().tolist() == at_corner
 
 
 @settings(max_examples=40, deadline=None)
@@ -296,14 +301,18 @@ def test_closed_surfaces_have_no_holes_from_inside(seed: int, subdivisions: int)
     assert (rasterize(mesh_of(sphere.vertices, sphere.faces), camera).face_index >= 0).all()
 
 
-@pytest.mark.parametrize("aside", [0.0, 1e-16, 1e-12, 1e-10, 1e-9, 1e-6])
-def test_a_face_seen_edge_on_hides_nothing_and_has_its_own_depth(aside: float) -> None:
-    wall = [[-90, -90, 5], [90, -90, 5], [0, 90, 5]]
-    edge_on = [[0, -1, 1], [0, 1, 1], [0, 0, 3]]
-    K = torch.tensor([[20.0, 0, 8.5], [0, 20, 6.5], [0, 0, 1]], dtype=torch.float64)  # x = 0 runs through pixel centres
+@pytest.mark.parametrize("aside", [0.0, 1e-16, 1e-12, 1e-11, 5e-11, 1e-10, 1e-9, 1e-6])
+@pytest.mark.parametrize("shift", [0.0, 5e-10, -5e-10, 9e-10, -9e-10])
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_face_seen_edge_on_hides_nothing_and_has_its_own_depth(aside: float, shift: float, turned: bool) -> None:
+    corners = np.array([[0, -1, 1], [0, 1, 1], [0, 0, 3], [-90, -90, 5], [90, -90, 5], [0, 90, 5]])
+    K = torch.tensor([[20.0, 0, 8.5 + shift], [0, 20, 8.5 + shift], [0, 0, 1]], dtype=torch.float64)
     world_to_camera = torch.eye(4, dtype=torch.float64)
-    world_to_camera[0, 3] = aside
-    fragments = rasterize(mesh_of([*edge_on, *wall], [[0, 1, 2], [3, 4, 5]]), Camera(K, world_to_camera, 17, 13))
+    world_to_camera[:2, 3] = aside
+    mesh = mesh_of(corners[:, [1, 0, 2]] if turned else corners, [[0, 1, 2], [3, 4, 5]])
+    fragments = rasterize(mesh, Camera(K, world_to_camera, 17, 17))
+    if turned:
+        fragments = Fragments(fragments.face_index.T, fragments.barycentric.transpose(0, 1), fragments.depth.T)
     on_wall = fragments.face_index == 1
     assert on_wall[:, torch.arange(17) != 8].all()
     assert torch.allclose(fragments.depth[on_wall], torch.tensor(5.0))
@@ -359,6 +368,8 @@ def test_blocks_and_threads_do_not_change_a_bit() -> None:
     assert equal(whole, rasterize(mesh, camera))
     for max_bytes in (1 << 17, 1 << 20):
         assert equal(whole, rasterize(mesh, camera, max_bytes=max_bytes))
+    few = soup(5, 1)
+    assert equal(rasterize(few, plain_camera()), rasterize(few, plain_camera(), max_bytes=1))
     threads = torch.get_num_threads()
     torch.set_num_threads(1 if threads > 1 else 2)
     try:

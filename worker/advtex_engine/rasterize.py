@@ -9,7 +9,7 @@ more half-plane in the image, because 1/z is linear there: 1/z = n.d / det, n = 
 Faces are cut into rows and rows into pixels: a half-plane bounds a row from the left or from the right, so the pixels
 enumerated are exactly those covered. Edges are inclusive and widened by `_WIDEN` of a pixel, more than the rounding of
 float64 and far less than that of float32 positions, so meshes are watertight. A pixel goes to the face of least depth;
-where depths agree in their first 24 bits, to the lowest face index. Both sides of a face are visible.
+where depths round to the same float32, to the lowest face index. Both sides of a face are visible.
 
 Tables are one tensor per quantity: a gather from a vector is several times cheaper than one from rows or columns.
 """
@@ -27,11 +27,11 @@ NEAR = 0.01  # metres
 MAX_BYTES = 256 << 20
 
 _WIDEN = 1e-9  # pixels
-_EDGE_ON = 1e-12  # a determinant below this share of the lengths that make it: the face is a line or less
 _TINY = 1e-30  # stands for a zero divisor: the bound that it gives lies far outside of the image, on the right side
 
 _FACE_BITS = 29  # the mantissa of float64 is that much longer than the one of float32: room for a face index
 _FACE_MASK = (1 << _FACE_BITS) - 1
+_HALF = 1 << (_FACE_BITS - 1)
 _EMPTY = (1 << 63) - 1
 
 _ITEM_BYTES = 600  # peak of all temporaries per face, span or pixel of a block
@@ -131,7 +131,7 @@ def _planes(p: list[_Point]) -> tuple[list[_Point], _Point, Tensor]:
     side, other = _minus(p[1], p[0]), _minus(p[2], p[0])
     normal = _cross(side, other)
     det = _dot(p[0], normal)
-    valid = det.square() > _EDGE_ON**2 * (_dot(p[0], p[0]) * _dot(side, side) * _dot(other, other))
+    valid = (det != 0) & det.isfinite()
     inverse = det.reciprocal()
     edges = (_cross(p[1], p[2]), _cross(p[2], p[0]), _cross(p[0], p[1]))
     return [_times(edge, inverse) for edge in edges], _times(normal, inverse), valid
@@ -165,6 +165,7 @@ def _draw_faces(
     top, rows = _rows(p, camera, near)
     edges, (du, dv, constant), valid = _planes(p)
     kept = (valid & (rows > 0)).nonzero()[:, 0]
+    least, most = (bound.index_select(0, kept) for bound in _depth_range(p, near))
     near_plane = (-du, -dv, 1 / near - constant)
     bounds = [_row_bound(_select(half_plane, kept)) for half_plane in (*edges, near_plane)]
     du, dv, constant = _select((du, dv, constant), kept)
@@ -182,8 +183,21 @@ def _draw_faces(
         left, count = _centers(low, high, camera.width)
         step = du.index_select(0, face)
         start = step * left + dv.index_select(0, face).mul_(y).add_(constant.index_select(0, face))
+        # A face seen edge-on is so steep that 1/z runs off within the breadth by which edges are widened.
+        last, low, high = count - 1, least.index_select(0, face), most.index_select(0, face)
+        end = torch.minimum(torch.maximum(step.mul_(last).add_(start), low), high)
+        start = torch.minimum(torch.maximum(start, low), high)
+        step = end.sub_(start).div_(last.clamp_(min=1))
         pixel = row.mul_(camera.width).add_(left)
         _draw_spans(nearest, pixel, count, start, step, index.index_select(0, face), block)
+
+
+def _depth_range(p: list[_Point], near: float) -> tuple[Tensor, Tensor]:
+    """Least and most 1/z [F] that a pixel can see of each face."""
+    first, second, third = (corner[2].clamp(min=near).reciprocal_() for corner in p)
+    most = torch.maximum(torch.maximum(first, second), third)
+    ahead = torch.minimum(torch.minimum(p[0][2], p[1][2]), p[2][2]) >= near
+    return torch.where(ahead, torch.minimum(torch.minimum(first, second), third), _TINY), most
 
 
 def _select(tensors: _Point, index: Tensor) -> _Point:
@@ -205,8 +219,8 @@ def _draw_spans(
     for part in _parts(count, block):
         span, k = _expand(count[part], None)
         span += part.start
-        depth = step.index_select(0, span).mul_(k).add_(start.index_select(0, span)).clamp_(min=_TINY).reciprocal_()
-        key = depth.view(torch.int64).bitwise_and_(~_FACE_MASK).bitwise_or_(index.index_select(0, span))
+        depth = step.index_select(0, span).mul_(k).add_(start.index_select(0, span)).reciprocal_()
+        key = depth.view(torch.int64).add_(_HALF).bitwise_and_(~_FACE_MASK).bitwise_or_(index.index_select(0, span))
         nearest.scatter_reduce_(0, k.add_(pixel.index_select(0, span)), key, "amin")
 
 
@@ -266,12 +280,12 @@ def _resolve(nearest: Tensor, points: Tensor, corners: Tensor, camera: Camera, b
     place.index_copy_(0, index, torch.arange(len(index), device=device))
     names = index.int()
     names[-1] = -1
-    # The last column is for pixels that see nothing: infinitely far, so depth and all weights / z come out as 0.
+    # The last column stays 0, for pixels that see nothing: depth and barycentrics come out as 0.
     tables = torch.zeros((12, len(index)), dtype=torch.float64, device=device)
-    tables[-1, -1] = torch.inf
     for part in _blocks(len(index) - 1, block):
-        edges, inverse_depth, _ = _planes(_face_points(points, corners, index[part]))
-        for table, values in zip(tables, (*edges[0], *edges[1], *edges[2], *inverse_depth), strict=True):
+        p = _face_points(points, corners, index[part])
+        edges, _, _ = _planes(p)
+        for table, values in zip(tables, (*edges[0], *edges[1], *edges[2], *(corner[2] for corner in p)), strict=True):
             table[part] = values
 
     face_index = torch.empty(height * width, dtype=torch.int32, device=device)
@@ -287,11 +301,13 @@ def _resolve(nearest: Tensor, points: Tensor, corners: Tensor, camera: Camera, b
         pixel = (column[: len(row)], row)
         which = place.index_select(0, nearest[part])
         face_index[part] = names.index_select(0, which)
-        z = _linear(tables[9:], which, pixel).reciprocal_()
+        weights = [_linear(tables[k : k + 3], which, pixel).clamp_(min=0) for k in (0, 3, 6)]
+        over = (weights[0] + weights[1] + weights[2]).clamp_(min=_TINY).reciprocal_()
+        z = torch.zeros_like(over)
+        for corner, weight in enumerate(weights):
+            barycentric[part, corner] = weight.mul_(over)
+            z += weight.mul_(tables[9 + corner].index_select(0, which))
         depth[part] = z
-        for corner in range(3):
-            weight = _linear(tables[3 * corner : 3 * corner + 3], which, pixel).mul_(z)
-            barycentric[part, corner] = weight.clamp_(0, 1)
     return Fragments(face_index.view(height, width), barycentric.view(height, width, 3), depth.view(height, width))
 
 

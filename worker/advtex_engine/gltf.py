@@ -24,7 +24,7 @@ COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5
 COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 TRIANGLES, STRIP, FAN = 4, 5, 6
 # A node may be drawn many times over by its parents; what a scene of this size draws is bounded.
-MAX_NODES = 100_000
+MAX_NODES = 20_000
 COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 
 Fetch = Callable[[str], bytes]

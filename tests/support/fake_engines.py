@@ -110,9 +110,7 @@ def rejects(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume:
     )
 
 
-def refuses_options(
-    scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor
-) -> None:
+def refuses(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
     raise OptionError("holdout 500 leaves no frame; choose less")
 
 

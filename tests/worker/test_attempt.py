@@ -7,14 +7,16 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import fake_engines
 import pytest
 
 from advtex_contract.jobs import JobState
 from advtex_store import keys
+from advtex_store.blobs import FolderBlobs
 from advtex_store.models import JobRow
+from advtex_store.results import Results
 from advtex_store.store import Store
 from advtex_worker.settings import WorkerSettings
 from advtex_worker.tasks import Host, run_attempt
@@ -195,6 +197,42 @@ def test_sigterm_preempts_without_counting_as_a_death(store: Store, host: Hosts,
     state = json.loads(result(store, job_id).split("\n", 1)[1])
     assert state["chain"] == fake_engines.chain(100)
     assert state["began"] == sorted(state["began"])
+
+
+def test_a_sigterm_to_the_runner_alone_is_a_preemption_too(store: Store, host: Hosts, new_job: NewJob) -> None:
+    job_id = new_job(steps=1000)
+    parent = os.fork()
+    if parent == 0:
+        run_attempt(host("stepping"), job_id, 1)
+        os._exit(0)
+    wait_until(lambda: step_of(store, job_id) >= 5)
+    (runner,) = _children(parent)
+    os.kill(runner, signal.SIGTERM)
+    os.waitpid(parent, 0)
+    row = store.records.job(job_id)
+    assert (row.state, row.attempt, row.deaths) == (JobState.preempted, 2, 0)
+
+
+def test_a_cancel_does_not_wait_for_a_long_fetch(
+    store: Store, settings: WorkerSettings, new_job: NewJob, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_id = new_job()
+    asked = threading.Event()
+
+    def endless(*_arguments: object) -> Iterator[bytes]:
+        store.records.cancel(job_id)
+        asked.set()
+        while True:
+            time.sleep(0.01)
+            yield b"0"
+
+    monkeypatch.setattr(FolderBlobs, "stream", endless)
+    monkeypatch.setattr(Results, "adopt", lambda _self, _job_id: False)
+    began = time.monotonic()
+    run_attempt(Host(settings, engine="fake_engines:quick"), job_id, 1)
+    assert asked.is_set()
+    assert time.monotonic() - began < 2.0
+    assert store.records.job(job_id).state == JobState.canceled
 
 
 @pytest.mark.parametrize("engine", ["hangs", "ignores_stop"])

@@ -147,7 +147,7 @@ class Attempt:
 
     def _run(self) -> None:
         try:
-            self._persist(lambda: self._store.blobs.fetch(self._claim.scan_key, self._space.scan))
+            self._persist(self._fetch_scan)
         except BlobNotFound:
             message = "the scan is no longer stored; submit it again"
             self._store.records.fail(self._job_id, self._number, JobError(code="scan_missing", message=message))
@@ -155,6 +155,7 @@ class Attempt:
         base = self._persist(lambda: restore(self._store.blobs, self._job_id, self._number, self._space.work))
         self._log.info("attempt begins", resumed_files=len(base.files))
         uploader = CheckpointUploader(self._store.blobs, self._job_id, self._number, base, self._keeper.beat)
+        ended: FinishedEvent | FailedEvent | StoppedEvent | None = None
         try:
             with self._spawn(resume=bool(base.files)) as child:
                 self._child = child
@@ -162,11 +163,19 @@ class Attempt:
         finally:
             if self._killer:
                 self._killer.cancel()
-            if self._keeper.ending is Ending.lost:
+            if self._keeper.ending is Ending.lost or isinstance(ended, FinishedEvent):
                 uploader.abandon()
             else:
                 uploader.finish()
         self._conclude(ended, child.returncode)
+
+    def _fetch_scan(self) -> None:
+        """In pieces, so that a cancel does not wait for gigabytes."""
+        with self._space.scan.open("wb") as file:
+            for chunk in self._store.blobs.stream(self._claim.scan_key):
+                file.write(chunk)
+                if self._keeper.ending:
+                    raise Interrupted
 
     def _spawn(self, resume: bool) -> Child:
         space = self._space
@@ -221,7 +230,7 @@ class Attempt:
         elif isinstance(ended, FailedEvent):
             error = JobError(code=ended.code, message=ended.message, details=ended.details, log_tail=tail)
             records.fail(job_id, number, error)
-        elif self._keeper.ending:
+        elif self._keeper.ending or isinstance(ended, StoppedEvent):
             self._give_back()
         else:
             sentence = death_sentence(code)
@@ -229,10 +238,10 @@ class Attempt:
             self._log.warning("runner died", reason=sentence, job_is=state)
 
     def _give_back(self) -> None:
-        """After a cancel or a SIGTERM, with whatever checkpoint there is."""
+        """After a cancel or a SIGTERM, also one that only the runner got, with whatever checkpoint there is."""
         if self._keeper.ending is Ending.cancel:
             self._store.records.canceled(self._job_id, self._number)
-        elif self._keeper.ending is Ending.preempt:
+        elif self._keeper.ending is not Ending.lost:
             self._store.records.preempt(self._job_id, self._number)
 
     def _on_ending(self, ending: Ending) -> None:
@@ -256,7 +265,7 @@ class Attempt:
         while True:
             try:
                 return action()
-            except (StaleAttempt, BlobNotFound):
+            except (StaleAttempt, BlobNotFound, Interrupted):
                 raise
             except Exception as error:
                 self._log.warning("storage is in trouble, trying again", error=f"{type(error).__name__}: {error}")

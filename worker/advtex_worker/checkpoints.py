@@ -138,6 +138,7 @@ class CheckpointUploader:
         while self._wait(rest):
             with self._changed:
                 batch, self._pending = self._pending, {}
+                last_try = self._closing
             began = time.monotonic()
             try:
                 self._commit(batch)
@@ -145,7 +146,7 @@ class CheckpointUploader:
                 log.warning("checkpoint not uploaded", job=self._job_id, error=str(error))
                 with self._changed:
                     self._pending = batch | self._pending
-                if self._closing:
+                if last_try:
                     return
                 rest = RETRY_SECONDS
             else:

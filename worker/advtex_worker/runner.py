@@ -151,6 +151,7 @@ def main() -> None:
     os.dup2(2, 1)  # stray prints belong in the log
     request = Request.model_validate_json(sys.stdin.readline())
     stop = threading.Event()
+    signal.signal(signal.SIGTERM, lambda _signum, _frame: stop.set())  # whoever stops all processes at once
     threading.Thread(target=_listen, args=(sys.stdin, stop), daemon=True).start()
     reporter = Reporter(request, events, stop)
     reporter.tell(run(request, reporter))

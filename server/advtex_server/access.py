@@ -8,7 +8,7 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from advtex_contract.errors import ErrorCode
-from advtex_server.errors import answer, translated
+from advtex_server.errors import respond
 from advtex_server.refusal import ApiError
 from advtex_store.accounts import Accounts
 
@@ -35,7 +35,7 @@ class AccessMiddleware:
             if not scope["path"].startswith(UPLOADS):
                 receive = self._limited(headers, receive)
         except Exception as error:
-            await answer(translated(error))(scope, receive, send)
+            await respond(scope, error)(scope, receive, send)
             return
         await self.app(scope, receive, send)
 

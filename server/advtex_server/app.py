@@ -50,6 +50,7 @@ def create_app(settings: ServerSettings) -> FastAPI:
             "4XX": {"model": ErrorBody, "description": "refused"},
             "5XX": {"model": ErrorBody, "description": "not possible now"},
         },
+        docs_url=None,  # their pages load scripts from elsewhere
         redoc_url=None,
     )
     app.state.service = Service(store, settings, dispatcher.wake)

@@ -12,6 +12,7 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
+from starlette.types import Scope
 
 from advtex_contract.errors import ErrorCode, ErrorDetail
 from advtex_server.refusal import ApiError
@@ -74,16 +75,19 @@ def translated(error: Exception) -> ApiError:
             return ApiError(ErrorCode.internal, "something went wrong in the server; its log says what")
 
 
+def respond(scope: Scope, error: Exception) -> JSONResponse:
+    """The answer to a request that ended in an exception; what is the server's fault is logged."""
+    told = translated(error)
+    if told.status >= 500:
+        log.error("request failed", method=scope["method"], path=scope["path"], code=told.body.code, exc_info=error)
+    return answer(told)
+
+
 def install(app: FastAPI) -> None:
     """Let every exception of a route end in the one body."""
 
     async def handle(request: Request, error: Exception) -> JSONResponse:
-        told = translated(error)
-        if told.status >= 500:
-            log.error(
-                "request failed", method=request.method, path=request.url.path, code=told.body.code, exc_info=error
-            )
-        return answer(told)
+        return respond(request.scope, error)
 
     for kind in (
         ApiError,

@@ -103,7 +103,7 @@ class Service:
                 with incoming.writer:
                     yield incoming
             except BaseException:
-                self.store.uploads.discard(row.id)
+                self._forget(row)
                 raise
         finally:
             with self._lock:
@@ -175,6 +175,13 @@ class Service:
         raise ApiError(ErrorCode.not_found, f"job {job_id} has no result {name!r}")
 
     # -- inside ---------------------------------------------------------------------------------------------------
+
+    def _forget(self, row: UploadRow) -> None:
+        try:
+            self.store.uploads.discard(row.id)
+            self.store.blobs.delete(keys.scan_key(row.id))
+        except Exception as error:  # the row, if it is still there, expires within a day, and its blob with it
+            log.warning("upload not removed yet", upload=row.id, error=str(error))
 
     def _checked_job(self, owner: str, spec: JobSpec, reservation: Reservation | None) -> JobRow:
         upload = self.store.uploads.upload(spec.upload_id, owner)

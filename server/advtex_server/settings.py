@@ -12,6 +12,7 @@ class ServerSettings(StoreSettings):
 
     max_upload_bytes: int = Field(default=32 << 30, gt=0)
     disk_reserve_bytes: int = Field(default=1 << 30, ge=0, description="uploads that would leave less are refused")
+    idle_seconds: float = Field(default=60.0, gt=0, description="an upload that sends nothing for so long is ended")
     max_body_bytes: int = Field(default=1 << 20, gt=0, description="of requests that are not uploads")
     dispatch_seconds: float = Field(default=1.0, gt=0, description="between looks at waiting jobs")
     reconcile_seconds: float = Field(default=10.0, gt=0, description="between looks at leases and old blobs")

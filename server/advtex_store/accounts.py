@@ -15,7 +15,7 @@ from advtex_store.database import Database
 from advtex_store.errors import RecordNotFound
 from advtex_store.models import ApiKeyRow
 
-SCOPES = ("read", "write", "metrics")
+SCOPES = ("read", "write")
 _KEY = re.compile(r"adv_([0-9a-f]{12})_([A-Za-z0-9]{40})")
 _ALPHABET = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789"
 

@@ -13,7 +13,7 @@ import os
 import re
 import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +24,7 @@ from urllib.parse import unquote, urlsplit
 from advtex_store.errors import BlobNotFound, BlobsUnavailable, NoSpace
 
 CHUNK = 1 << 20
+PLACE_ATTEMPTS = 5
 _KEY = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*(/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
 
 
@@ -217,9 +218,7 @@ class FolderBlobs(Blobs):
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())
-            self._make_parents(key)
-            (self.root / key).hardlink_to(name)
-            _fsync_dir((self.root / key).parent)
+            self._place(key, lambda target: target.hardlink_to(name))
         except FileExistsError:
             return False
         except OSError as error:
@@ -272,9 +271,19 @@ class FolderBlobs(Blobs):
             raise BlobsUnavailable(f"the folder {self.root} cannot be written to: {error.strerror}") from error
 
     def _publish(self, path: Path, key: str) -> None:
-        self._make_parents(key)
+        self._place(key, path.replace)
+
+    def _place(self, key: str, action: Callable[[Path], object]) -> None:
+        """Let a file appear durably. Again if somebody who deletes blobs removed its new folder for being empty."""
         target = self.root / key
-        path.replace(target)
+        for attempt in range(PLACE_ATTEMPTS):
+            try:
+                self._make_parents(key)
+                action(target)
+                break
+            except FileNotFoundError:
+                if attempt == PLACE_ATTEMPTS - 1:
+                    raise
         _fsync_dir(target.parent)
 
     def path(self, key: str) -> Path:

@@ -23,11 +23,11 @@ STARTED_GRACE_SECONDS = 30.0  # between taking an id and claiming the row; later
 
 
 def connect_redis(settings: StoreSettings) -> Redis:
-    """A client that gives up after a few seconds instead of hanging when Redis is away."""
+    """A client that gives up after seconds when Redis is away; RQ's workers raise the limit for their own waits."""
     password = settings.redis_password()
     extra = {} if password is None else {"password": password}
     return Redis.from_url(
-        settings.redis_url, socket_connect_timeout=3, socket_timeout=None, health_check_interval=30, **extra
+        settings.redis_url, socket_connect_timeout=3, socket_timeout=10, health_check_interval=30, **extra
     )
 
 

@@ -16,10 +16,13 @@ from typing import Any
 import httpx
 import psutil
 import pytest
+from click.testing import Result
+from typer.testing import CliRunner
 
 from advtex_server import embedded
 from advtex_server.children import Child
 from advtex_server.embedded import SetupError, only_one, redis_binary, write_private
+from advtex_server.main import app
 
 COMMAND = [sys.executable, "-m", "advtex_server.main"]
 
@@ -168,33 +171,32 @@ def test_a_second_one_on_the_same_folder_is_refused(up: Up, tmp_path: Path) -> N
     assert "choose another --port" in third.stderr
 
 
-def run(data: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
-        "ADVTEX_DATA_DIR": str(data),
-        "ADVTEX_DISK_RESERVE_BYTES": "0",
-        "ADVTEX_REDIS_URL": "redis://127.0.0.1:1/0",
-        "NO_COLOR": "1",
-    }
-    return subprocess.run([*COMMAND, *arguments], env=environment, capture_output=True, text=True, timeout=60)
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
+    def invoke(data: Path, *arguments: str) -> Result:
+        monkeypatch.setenv("ADVTEX_DATA_DIR", str(data))
+        monkeypatch.setenv("ADVTEX_DISK_RESERVE_BYTES", "0")
+        monkeypatch.setenv("ADVTEX_REDIS_URL", "redis://127.0.0.1:1/0")
+        return CliRunner().invoke(app, arguments)
+
+    return invoke
 
 
-def test_keys_and_doctor(tmp_path: Path) -> None:
+def test_keys_and_doctor(tmp_path: Path, run: Callable[..., Result]) -> None:
     created = run(tmp_path, "keys", "create", "laptop", "--scope", "read", "--days", "3")
     key = created.stdout.strip()
-    assert key.startswith("adv_"), created.stderr
+    assert key.startswith("adv_"), created.output
     (row,) = [json.loads(line) for line in run(tmp_path, "keys", "list").stdout.splitlines()]
     assert (row["name"], row["scopes"], row["revoked_at"]) == ("laptop", ["read"], None)
     assert abs(row["expires_at"] - row["created_at"] - 3 * 86400) < 60
-    assert run(tmp_path, "keys", "revoke", row["id"]).returncode == 0
+    assert run(tmp_path, "keys", "revoke", row["id"]).exit_code == 0
     assert json.loads(run(tmp_path, "keys", "list").stdout)["revoked_at"] is not None
-    assert run(tmp_path, "keys", "revoke", "none").returncode == 1
-    assert run(tmp_path, "keys", "create", "--scope", "fly").returncode == 2
+    assert run(tmp_path, "keys", "revoke", "none").exit_code == 1
+    assert run(tmp_path, "keys", "create", "--scope", "fly").exit_code == 2
     doctor = run(tmp_path, "doctor")
-    assert doctor.returncode == 0
+    assert doctor.exit_code == 0
     assert "FAIL redis: Redis does not answer" in doctor.stdout
-    assert run(tmp_path / "empty", "doctor").returncode == 1
+    assert run(tmp_path / "empty", "doctor").exit_code == 1
 
 
 def test_without_any_redis_the_message_helps(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 
 import psutil
 import pytest
+from sqlalchemy.exc import OperationalError
 
 from advtex_store import keys
 from advtex_store.blobs import open_blobs
@@ -124,6 +125,26 @@ def test_a_line_that_breaks_leaves_nothing(live: Any) -> None:
     connection.close()
     wait_until(lambda: nothing_is_kept(live))
     assert live.upload()
+
+
+def test_a_half_open_line_is_ended(make_live: Callable[..., Any]) -> None:
+    live = make_live(idle_seconds=0.3)
+    connection = raw_request(live, live.key, 10_000_000)
+    connection.sendall(b"x" * 4_000_000)
+    assert connection.recv(4096).startswith(b"HTTP/1.1 408")
+    connection.close()
+    wait_until(lambda: nothing_is_kept(live))
+
+
+def test_a_database_that_breaks_at_the_end_keeps_nothing(
+    live: Any, is_error: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> None:
+        raise OperationalError("", {}, Exception("away"))
+
+    monkeypatch.setattr(live.store.uploads, "finish", broken)
+    is_error(live.http.post("/v1/uploads", content=DATA), 503, "unavailable")
+    assert nothing_is_kept(live)
 
 
 def test_a_server_that_stops_in_the_middle_leaves_nothing(live: Any) -> None:

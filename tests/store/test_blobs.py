@@ -179,6 +179,27 @@ def test_bytes_are_synced_before_they_get_their_name(tmp_path: Path, monkeypatch
     assert {f"sync {root}", f"sync {root}/a"} <= set(calls[:renamed])
 
 
+def test_writing_and_deleting_in_one_folder(tmp_path: Path) -> None:
+    """Who deletes removes empty folders; who writes at that moment must not notice."""
+    blobs = FolderBlobs(tmp_path / "root")
+    errors: list[Exception] = []
+
+    def work(number: int) -> None:
+        try:
+            for _ in range(150):
+                blobs.put(f"a/b/{number}", b"x")
+                blobs.delete(f"a/b/{number}")
+        except Exception as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=work, args=(n,)) for n in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert errors == []
+
+
 FILL = """
 import resource, signal, sys
 from pathlib import Path

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import AsyncGenerator, AsyncIterator
 from typing import Annotated
 from urllib.parse import unquote
 
@@ -47,7 +49,7 @@ async def create_upload(
     incoming = await run_in_threadpool(block.__enter__)
     try:
         buffer = bytearray()
-        async for chunk in request.stream():
+        async for chunk in _unless_silent(request.stream(), service.settings.idle_seconds):
             buffer += chunk
             if len(buffer) >= BUFFER:
                 await run_in_threadpool(incoming.write, bytes(buffer))
@@ -60,6 +62,19 @@ async def create_upload(
         raise
     await run_in_threadpool(block.__exit__, None, None, None)
     return view
+
+
+async def _unless_silent(chunks: AsyncGenerator[bytes, None], seconds: float) -> AsyncIterator[bytes]:
+    """A half-open connection would hold its room on the disk for ever."""
+    while True:
+        try:
+            async with asyncio.timeout(seconds):
+                chunk = await anext(chunks, None)
+        except TimeoutError:
+            raise ApiError(ErrorCode.bad_request, f"nothing came for {seconds:g} s", status=408) from None
+        if chunk is None:
+            return
+        yield chunk
 
 
 @router.get("/uploads/{upload_id}")

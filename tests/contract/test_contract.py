@@ -1,0 +1,93 @@
+"""The shared words: bounds, defaults, and that they stay light."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from datetime import UTC, datetime
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from advtex_contract.errors import ErrorBody, ErrorCode, ErrorDetail
+from advtex_contract.jobs import TERMINAL, JobSpec, JobState, JobView
+from advtex_contract.options import PRESET_HELP, JobOptions, Preset
+
+
+def test_every_preset_is_explained() -> None:
+    assert set(PRESET_HELP) == set(Preset)
+
+
+def test_defaults_suit_most_scans() -> None:
+    assert JobOptions().model_dump(exclude_none=True) == {"preset": "auto", "max_texture_size": 4096, "seed": 0}
+
+
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [
+        ("width", 64, 4096),
+        ("height", 64, 4096),
+        ("steps", 1, 1_000_000),
+        ("face_budget", 100, 2_000_000),
+        ("max_texture_size", 256, 16384),
+        ("holdout", 2, 1000),
+        ("seed", 0, 2**31 - 1),
+    ],
+)
+def test_bounds_of_options(name: str, low: int, high: int) -> None:
+    for value in (low, high):
+        assert getattr(JobOptions.model_validate({name: value}), name) == value
+    for value in (low - 1, high + 1, low + 0.5, "many"):
+        with pytest.raises(ValidationError, match=name):
+            JobOptions.model_validate({name: value})
+
+
+@pytest.mark.parametrize("options", [{"preset": "fastest"}, {"stpes": 3}])
+def test_unknown_options_are_refused(options: dict[str, object]) -> None:
+    with pytest.raises(ValidationError, match=next(iter(options))):
+        JobOptions.model_validate(options)
+
+
+@given(st.text(max_size=250))
+def test_labels_are_one_printable_line(label: str) -> None:
+    bad = len(label) > 200 or any(ord(c) < 32 or ord(c) == 127 for c in label)
+    try:
+        assert JobSpec(upload_id="a", label=label).label == label
+    except ValidationError:
+        assert bad
+    else:
+        assert not bad
+
+
+def test_terminal_states() -> None:
+    waiting_or_worked_on = {JobState.uploading, JobState.queued, JobState.running, JobState.preempted}
+    assert set(JobState) - TERMINAL == waiting_or_worked_on
+
+
+def test_a_job_survives_the_wire() -> None:
+    now = datetime.now(UTC)
+    job = JobView(
+        id="a", state=JobState.queued, upload_id="b", options=JobOptions(seed=7), created_at=now, updated_at=now
+    )
+    assert JobView.model_validate_json(job.model_dump_json()) == job
+    assert job.model_dump(mode="json")["state"] == "queued"
+
+
+def test_errors_survive_the_wire() -> None:
+    body = ErrorBody(
+        code=ErrorCode.invalid_scan, message="no", details=[ErrorDetail(where="mesh.ply", message="empty")]
+    )
+    assert ErrorBody.model_validate_json(body.model_dump_json()) == body
+    assert all(code.value == code.name for code in ErrorCode)
+    with pytest.raises(ValidationError):
+        ErrorBody.model_validate({"code": "unheard_of", "message": "x"})
+
+
+def test_the_contract_is_light() -> None:
+    script = (
+        "import sys, advtex_contract.jobs, advtex_contract.errors, advtex_contract.options;"
+        "print([m for m in ('httpx', 'redis', 'numpy', 'torch', 'fastapi', 'sqlalchemy') if m in sys.modules])"
+    )
+    assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout == "[]\n"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,14 @@ from advtex_engine.synthesize import CAMERA_ERROR, DISTANCE, GEOMETRY_ERROR, com
 from advtex_scan.check import check_scan
 
 VIEWS, WIDTH, HEIGHT = 6, 96, 72
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_lights() -> Iterator[None]:
+    """Shadows are as good from few lights here, and sooner."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(synthetic_object, "LIGHTS", 8)
+        yield
 
 
 @pytest.fixture(scope="module")

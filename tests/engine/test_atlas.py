@@ -302,7 +302,7 @@ def brute_force_coverage(triangles: np.ndarray, width: int, height: int, reach: 
                     ring = np.array(polygon)
                     following = np.roll(ring, -1, axis=0)
                     enclosed = abs((ring[:, 0] * following[:, 1] - ring[:, 1] * following[:, 0]).sum())
-                    counts[row, column] += enclosed > 1e-9
+                    counts[row, column] += enclosed > 0
     return counts
 
 
@@ -381,6 +381,21 @@ def test_density_of_a_plane_seen_head_on_and_at_an_angle() -> None:
         assert density.item() == pytest.approx(300 * 300 / 16 * np.cos(angle), rel=0.02)
 
 
+def test_a_face_larger_than_the_image_counts_where_it_is_seen() -> None:
+    """Its centroid and corners lie outside of the image, 16 m to the left of the axis."""
+    mesh = Mesh(torch.tensor([(0.0, 16, -50), (0, 16, 50), (0, -80, 0)]), torch.tensor([[0, 1, 2]]))
+    density = pixel_density(mesh, [camera((4, 0, 0))])
+    assert density.item() == pytest.approx(300 * 300 / 16, rel=0.05)
+
+
+def test_a_room_of_twelve_faces_is_seen_from_inside() -> None:
+    room = of_trimesh(trimesh.creation.box((6, 5, 3)))
+    atlas = build_atlas(
+        room, [camera(eye) for eye in ((0.5, 0, 0.1), (-0.5, 0, 0.1), (0, 0.5, 0.1))], TextureConfig(), Listener()
+    )
+    check_sound(atlas, room)
+
+
 def test_density_ignores_what_is_hidden_or_out_of_the_image() -> None:
     def sheet(x: float, shift: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
         y, z = np.meshgrid(np.linspace(-0.5, 0.5, 31) + shift, np.linspace(-0.5, 0.5, 31))
@@ -403,4 +418,4 @@ def test_density_ignores_what_is_hidden_or_out_of_the_image() -> None:
 def test_many_cameras_are_sampled_evenly() -> None:
     mesh = bumpy_sphere(2)
     few, many = pixel_density(mesh, AROUND[:2]), pixel_density(mesh, AROUND[:1] * 500 + AROUND[1:2] * 500)
-    assert few.sum() == pytest.approx(many.sum().item(), rel=1e-4)
+    assert few.sum() == pytest.approx(many.sum().item(), rel=2e-3)

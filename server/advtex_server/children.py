@@ -51,6 +51,7 @@ class Child:
 
     def start(self) -> None:
         """Start it. Its output goes to this process's stderr, so that stdout stays for machine-readable lines."""
+        self._asked = False
         self._process = subprocess.Popen(
             self._command,
             env=self._environment,

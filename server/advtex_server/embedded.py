@@ -56,8 +56,19 @@ class EmbeddedRedis:
         # The configuration goes through stdin: on the command line everybody could read the password.
         self.child = Child("redis", [redis_binary(), "-"], dict(os.environ), stdin=self._configuration, stop_seconds=15)
 
-    def wait_until_ready(self) -> None:
-        """Redis answers, or SetupError."""
+    def start(self) -> None:
+        """Until it answers; SetupError. An append-only file that it cannot read any more is moved aside: what was in it
+        is enqueued again from the rows."""
+        try:
+            self._start()
+        except SetupError:
+            if not (log := self.folder / "appendonly.aof").exists():
+                raise
+            log.replace(self.folder / "appendonly.unreadable")
+            self._start()
+
+    def _start(self) -> None:
+        self.child.start()
         deadline = time.monotonic() + START_SECONDS
         with redis.Redis.from_url(self.url, password=self.password_file.read_text().strip()) as client:
             while True:
@@ -66,6 +77,8 @@ class EmbeddedRedis:
                     return
                 except redis.RedisError as error:
                     if time.monotonic() > deadline or self.child.pid is None:
+                        self.child.ask_to_stop()
+                        self.child.wait()
                         raise SetupError(f"the embedded Redis does not start: {error}; its log is above") from error
                     time.sleep(0.05)
 

@@ -44,14 +44,12 @@ def up(settings: ServerSettings, host: str, port: int) -> None:
         children = []
         if "redis_url" not in settings.model_fields_set:
             embedded = EmbeddedRedis(settings.data_dir)
-            embedded.child.start()
+            embedded.start()
             children.append(embedded.child)
             settings = settings.model_copy(
                 update={"redis_url": embedded.url, "redis_password_file": embedded.password_file}
             )
         try:
-            if children:
-                embedded.wait_until_ready()
             upgrade_database(settings.database)
             database = Database(settings.database)
             client_key(settings.data_dir, Accounts(database), _url(listener))

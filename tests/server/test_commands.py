@@ -158,6 +158,16 @@ def test_children_die_with_the_service(up: Up) -> None:
     until(lambda: not any(child.is_running() for child in children.values()))
 
 
+def test_an_unreadable_append_only_file_stops_nothing(tmp_path: Path) -> None:
+    """Redis is transport: after a crash of the machine it starts empty rather than not at all."""
+    (tmp_path / "data" / "redis").mkdir(parents=True)
+    (tmp_path / "data" / "redis" / "appendonly.aof").write_bytes(b"*1\r\n$3\r\nnonsense" * 20)
+    up = Up(tmp_path)
+    assert up.http.get("/readyz").json()["checks"]["redis"]["ok"]
+    assert (tmp_path / "data" / "redis" / "appendonly.unreadable").exists()
+    assert up.stop() == 0
+
+
 def test_a_second_one_on_the_same_folder_is_refused(up: Up, tmp_path: Path) -> None:
     command = [*COMMAND, "up", "--port", "0", "--data-dir", str(up.data)]
     second = subprocess.run(command, env=up.environment, capture_output=True, text=True, timeout=30)

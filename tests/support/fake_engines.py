@@ -84,6 +84,7 @@ def crashes_once(scan: Path, out: Path, config: TextureConfig, *, work: Path, re
     mark = work / "mark.txt"
     if not resume:
         monitor.stage_started("atlas")
+        monitor.warning(Problem("few_views", "color/", "only 3 views", "take more"))
         mark.write_text("first attempt")
         monitor.checkpointed((mark,))
         os.kill(os.getpid(), signal.SIGKILL)

@@ -8,6 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import fake_engines
 import pytest
@@ -15,6 +16,7 @@ import pytest
 from advtex_contract.jobs import JobState
 from advtex_store import keys
 from advtex_store.blobs import FolderBlobs
+from advtex_store.errors import BlobsUnavailable, NoSpace
 from advtex_store.models import JobRow
 from advtex_store.results import Results
 from advtex_store.store import Store
@@ -162,6 +164,7 @@ def test_the_attempt_after_a_death_goes_on_from_the_checkpoint(store: Store, hos
     run_attempt(host("crashes_once"), job_id, 2)
     assert store.records.job(job_id).state == JobState.succeeded
     assert result(store, job_id) == "model.obj\nfirst attempt\n"
+    assert [warning["code"] for warning in store.records.job(job_id).warnings] == ["few_views"]
 
 
 def test_cancel_stops_within_two_seconds_and_retry_goes_on(store: Store, host: Hosts, new_job: NewJob) -> None:
@@ -233,6 +236,38 @@ def test_a_cancel_does_not_wait_for_a_long_fetch(
     assert asked.is_set()
     assert time.monotonic() - began < 2.0
     assert store.records.job(job_id).state == JobState.canceled
+
+
+def test_a_storage_that_fails_for_a_while_delays_the_results(
+    store: Store, host: Hosts, new_job: NewJob, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("advtex_worker.attempt.RETRY_SECONDS", 0.0)
+    commit, troubles = Results.commit, iter([NoSpace("the disk is full"), BlobsUnavailable("no answer")])
+
+    def flaky(*arguments: Any) -> Any:
+        for trouble in troubles:
+            raise trouble
+        return commit(*arguments)
+
+    monkeypatch.setattr(Results, "commit", flaky)
+    job_id = new_job()
+    run_attempt(host("quick"), job_id, 1)
+    row = store.records.job(job_id)
+    assert (row.state, row.attempt) == (JobState.succeeded, 1)
+
+
+def test_a_flaw_of_the_worker_itself_is_a_death_with_its_traceback(
+    store: Store, host: Hosts, new_job: NewJob, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def flawed(*_arguments: Any) -> None:
+        raise ZeroDivisionError("a flaw")
+
+    monkeypatch.setattr(Results, "commit", flawed)
+    job_id = new_job()
+    run_attempt(host("quick"), job_id, 1)
+    row = store.records.job(job_id)
+    assert (row.state, row.attempt, row.deaths) == (JobState.queued, 2, 1)
+    assert "ZeroDivisionError: a flaw" in row.log_tail
 
 
 @pytest.mark.parametrize("engine", ["hangs", "ignores_stop"])

@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import TypeVar
 
 import structlog
+from sqlalchemy.exc import SQLAlchemyError
 
 from advtex_contract.errors import ErrorDetail
 from advtex_contract.jobs import JobError
 from advtex_store import keys
-from advtex_store.errors import BlobNotFound, StaleAttempt
+from advtex_store.errors import BlobNotFound, StaleAttempt, StoreError
 from advtex_store.records import Claim
 from advtex_store.store import Store
 from advtex_worker.checkpoints import CheckpointUploader, restore
@@ -122,7 +123,7 @@ class Attempt:
         )
         self._child: Child | None = None
         self._killer: threading.Timer | None = None
-        self._warnings: list[ErrorDetail] = []
+        self._warnings: tuple[ErrorDetail, ...] = ()
         self._log = log.bind(job=claim.job_id, attempt=claim.attempt)
 
     def stop(self) -> None:
@@ -153,6 +154,7 @@ class Attempt:
             self._store.records.fail(self._job_id, self._number, JobError(code="scan_missing", message=message))
             return
         base = self._persist(lambda: restore(self._store.blobs, self._job_id, self._number, self._space.work))
+        self._warnings = base.warnings
         self._log.info("attempt begins", resumed_files=len(base.files))
         uploader = CheckpointUploader(self._store.blobs, self._job_id, self._number, base, self._keeper.beat)
         ended: FinishedEvent | FailedEvent | StoppedEvent | None = None
@@ -205,9 +207,10 @@ class Attempt:
                 case ProgressEvent():
                     tracker.progress(event)
                 case WarningEvent():
-                    self._warnings.append(event.problem)
+                    if event.problem not in self._warnings:  # a stage that is done again warns again
+                        self._warnings += (event.problem,)
                 case CheckpointEvent():
-                    uploader.add(event.files)
+                    uploader.add(event.files, self._warnings)
                 case _:
                     return event
             self._keeper.report(tracker.view, tracker.reached)
@@ -265,9 +268,9 @@ class Attempt:
         while True:
             try:
                 return action()
-            except (StaleAttempt, BlobNotFound, Interrupted):
+            except (StaleAttempt, BlobNotFound):
                 raise
-            except Exception as error:
+            except (OSError, StoreError, SQLAlchemyError) as error:
                 self._log.warning("storage is in trouble, trying again", error=f"{type(error).__name__}: {error}")
             for _ in range(int(RETRY_SECONDS / 0.5)):
                 if self._keeper.ending:

@@ -12,12 +12,13 @@ from __future__ import annotations
 import shutil
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import structlog
 from pydantic import BaseModel, ConfigDict
 
+from advtex_contract.errors import ErrorDetail
 from advtex_store import keys
 from advtex_store.blobs import Blobs
 from advtex_store.errors import BlobNotFound
@@ -40,12 +41,13 @@ class CheckpointFile(BaseModel):
 
 
 class CheckpointIndex(BaseModel):
-    """A complete checkpoint: name below the work folder -> file."""
+    """A complete checkpoint: name below the work folder -> file; and what stages that need no repeating warned of."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     sequence: int
     files: dict[str, CheckpointFile]
+    warnings: tuple[ErrorDetail, ...] = ()
 
 
 EMPTY = CheckpointIndex(sequence=0, files={})
@@ -105,6 +107,7 @@ class CheckpointUploader:
         self._job_id = job_id
         self._attempt = attempt
         self._committed = base
+        self._warnings = base.warnings
         self._pending: dict[str, Path] = {}
         self._changed = threading.Condition()
         self._closing = False
@@ -112,9 +115,10 @@ class CheckpointUploader:
         self._thread = threading.Thread(target=self._work, name="checkpoints", daemon=True)
         self._thread.start()
 
-    def add(self, files: Mapping[str, Path]) -> None:
-        """Snapshot files, by their name below the work folder. They are removed once they are no longer needed."""
+    def add(self, files: Mapping[str, Path], warnings: Iterable[ErrorDetail] = ()) -> None:
+        """Snapshot files by their name below the work folder, removed once they are no longer needed; all warnings."""
         with self._changed:
+            self._warnings = tuple(warnings)
             replaced = [self._pending[name] for name in files if name in self._pending]
             self._pending.update(files)
             self._changed.notify()
@@ -169,7 +173,7 @@ class CheckpointUploader:
             files[name] = CheckpointFile(key=key, size=written.size, sha256=written.sha256)
         if self._abandoned or not self._still_held():
             return
-        index = CheckpointIndex(sequence=sequence, files=files)
+        index = CheckpointIndex(sequence=sequence, files=files, warnings=self._warnings)
         self._blobs.put(_index_key(self._job_id, self._attempt), index.model_dump_json().encode())
         before, self._committed = self._committed, index
         named = {file.key for file in files.values()}

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from advtex_engine.checkpoint import WorkFolder
+from advtex_engine.errors import Stopped
 from advtex_engine.files import write_atomically
 from advtex_engine.metrics import score_views
 from advtex_engine.monitor import Monitor
@@ -46,6 +47,9 @@ class Stages:
 
     @contextmanager
     def run(self, stage: str) -> Iterator[None]:
+        """Raises Stopped before the stage when a stop was asked for: what earlier stages made is in the work folder."""
+        if self.monitor.stop_requested():
+            raise Stopped(f"stopped before {stage}; resume goes on from there")
         self.monitor.stage_started(stage)
         started = time.monotonic()
         yield

@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import UTC
 from typing import Any
 
 from pydantic import BaseModel
@@ -16,6 +17,8 @@ from rich.table import Table
 from advtex_client.errors import ClientError
 from advtex_contract.errors import ErrorDetail
 from advtex_contract.jobs import JobState, JobView, ResultFile
+
+LOG_LINES = 15  # of a failed job's log
 
 
 class Display:
@@ -133,16 +136,18 @@ def job_lines(job: JobView) -> str:
         lines.append(f"label    {job.label}")
     if progress.stage:
         steps = f", step {progress.step} of {progress.steps}" if progress.steps else ""
-        eta = f", about {duration(progress.eta_seconds)} left" if progress.eta_seconds is not None else ""
-        lines.append(f"stage    {progress.stage}{steps}{eta}")
+        lines.append(f"stage    {progress.stage}{steps}")
+        if job.state is JobState.running and progress.eta_seconds is not None:
+            lines.append(f"left     about {duration(progress.eta_seconds)} of this stage")
     if progress.losses:
         lines.append("losses   " + ", ".join(f"{name} {value:.4g}" for name, value in progress.losses.items()))
     lines += [f"warning  {line}" for line in finding_lines(job.warnings)]
     if job.error:
         lines += [f"error    {job.error.message}", *(f"         {line}" for line in finding_lines(job.error.details))]
+        lines += [f"log      {line}" for line in job.error.log_tail.splitlines()[-LOG_LINES:]]
     lines += [f"result   {file.name} ({file.size} bytes)" for file in job.results]
     if job.expires_at:
-        lines.append(f"kept until {job.expires_at:%Y-%m-%d %H:%M} UTC")
+        lines.append(f"kept until {job.expires_at.astimezone(UTC):%Y-%m-%d %H:%M} UTC")
     return "\n".join(lines)
 
 

@@ -28,7 +28,7 @@ from advtex_client.errors import (
     ServerError,
     WaitTimeoutError,
 )
-from advtex_contract.jobs import JobState, JobView
+from advtex_contract.jobs import TERMINAL, JobState, JobView
 from advtex_contract.options import PRESET_HELP, JobOptions, Preset
 from advtex_scan.check import check_scan
 
@@ -42,6 +42,7 @@ EXIT_CODES: dict[type[ClientError], int] = {
     IntegrityError: 6,
     WaitTimeoutError: 7,
 }
+RETRYABLE = (JobState.failed, JobState.canceled)
 USAGE = 2
 INTERRUPTED = 130
 
@@ -123,6 +124,9 @@ def submit(
         with Client(url, api_key) as client:
             with display.bytes_bar("sending") as bar:
                 job = client.submit(scan, options, label=label, new=new, on_bytes=bar.upload)
+            if job.state in TERMINAL:
+                again = f"`advtex-client retry {job.id}` or " if job.state in RETRYABLE else ""
+                display.note(f"this scan was submitted before: job {job.id} {job.state}; {again}--new does it again")
             if not wait and output is None:
                 display.data(job, job.id)
                 return

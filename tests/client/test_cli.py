@@ -167,12 +167,25 @@ def test_listing(server: FakeServer, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_job_in_words() -> None:
-    job = view("j0", JobState.failed, step=5, attempt=2, label="kitchen", error=JobError(code="x", message="no paint"))
+    error = JobError(code="x", message="no paint", log_tail="\n".join(f"line {i}" for i in range(30)))
+    job = view("j0", JobState.failed, step=5, attempt=2, label="kitchen", error=error)
     job.progress.stage, job.progress.steps, job.progress.eta_seconds = "optimization", 10, 200.0
     text = job_lines(job)
-    assert "failed (attempt 2)" in text
-    assert "step 5 of 10, about 3 min 20 s left" in text
-    assert "no paint" in text
+    for words in ("failed (attempt 2)", "step 5 of 10", "no paint", "line 29", "line 15"):
+        assert words in text
+    assert "line 14" not in text
+    assert "left" not in text, "nothing is left of a job that has ended"
+    running = job_lines(job.model_copy(update={"state": JobState.running}))
+    assert "about 3 min 20 s" in running
+
+
+def test_submitting_a_finished_scan_again_says_so(server: FakeServer, scan: Path) -> None:
+    run("submit", scan)
+    server.jobs["j0"] = view("j0", JobState.failed, error=JobError(code="x", message="no paint"))
+    again = run("submit", scan)
+    assert (again.exit_code, again.stdout) == (0, "j0\n")
+    assert "retry j0" in again.stderr
+    assert "--new" in again.stderr
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(0.4, "0 s"), (59.4, "59 s"), (60, "1 min 0 s"), (7500, "2 h 5 min")])

@@ -1,0 +1,36 @@
+# make install   .venv with everything for one machine
+# make test      every check and every test
+# make demo      a synthetic scan through the whole service; SCAN=path/to/scan.zip takes yours
+# make clean     removes what the others made
+
+PYTHON ?= python3
+BIN := .venv/bin
+STAMP := .venv/.installed
+RUFF := $(BIN)/ruff
+
+.PHONY: install test demo clean
+
+install: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; v = sys.version_info; (3, 11) <= v < (3, 13) or sys.exit( \
+	    "Python 3.11 or 3.12 is needed, $(PYTHON) is %d.%d: try make PYTHON=python3.12" % v[:2])'
+	@echo "installing into .venv ..."
+	@$(PYTHON) -m venv .venv
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[all,dev]'
+	@touch $@
+
+test: install
+	$(RUFF) check
+	$(RUFF) format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/pytest
+
+demo: install
+	@.ci/demo $(if $(SCAN),'$(SCAN)')
+
+clean:
+	rm -rf .venv demo dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf tests/engine/gltf_validator/node_modules
+	find client server worker tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,30 @@
+# syntax=docker/dockerfile:1
+# A worker with the engine: docker build -f docker/worker.Dockerfile .
+#
+# The base is plain Python: PyTorch's wheel brings the CUDA libraries that it was built with, so a CUDA base image would
+# only hold them twice. The host needs NVIDIA's driver and container toolkit. Without a GPU the same image uses the CPU.
+FROM python:3.12.11-slim-bookworm AS build
+RUN python -m venv /opt/advtex
+WORKDIR /src
+# The large wheels first: a change of the code does not fetch them again.
+COPY constraints.txt .
+RUN --mount=type=cache,target=/root/.cache/pip \
+    /opt/advtex/bin/pip install --constraint constraints.txt torch numpy opencv-python-headless
+COPY . .
+RUN --mount=type=cache,target=/root/.cache/pip \
+    /opt/advtex/bin/pip install --constraint constraints.txt '.[worker]'
+
+FROM python:3.12.11-slim-bookworm
+RUN useradd --system --uid 10001 --home-dir /var/lib/advtex --create-home advtex
+COPY --from=build /opt/advtex /opt/advtex
+ENV PATH=/opt/advtex/bin:$PATH \
+    PYTHONUNBUFFERED=1 \
+    NVIDIA_VISIBLE_DEVICES=all \
+    NVIDIA_DRIVER_CAPABILITIES=compute,utility \
+    ADVTEX_DATA_DIR=/var/lib/advtex
+USER 10001
+VOLUME /var/lib/advtex
+# Healthy as long as Redis knows a worker of this host: the worker renews that entry, which else expires.
+HEALTHCHECK --interval=30s --timeout=10s --start-period=30s --retries=3 \
+    CMD ["python", "-c", "import socket, sys; from rq import Worker; from advtex_store.queue import connect_redis; from advtex_store.settings import StoreSettings; sys.exit(socket.gethostname() not in [worker.hostname for worker in Worker.all(connect_redis(StoreSettings()))])"]
+ENTRYPOINT ["advtex-worker"]

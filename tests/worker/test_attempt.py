@@ -303,12 +303,14 @@ def test_a_lost_lease_ends_the_runner_and_commits_nothing(store: Store, host: Ho
 def test_leftovers_of_killed_attempts_are_swept_and_live_ones_kept(
     store: Store, host: Hosts, new_job: NewJob, settings: WorkerSettings
 ) -> None:
-    leftover = settings.workspaces / "dead-1"
+    leftover, foreign = settings.workspaces / "attempt-dead-1", settings.workspaces / "somebody's thesis"
     (leftover / "work").mkdir(parents=True)
+    foreign.mkdir()
     running = new_job(steps=100)
     thread = in_background(host("stepping"), running)
     wait_until(lambda: step_of(store, running) >= 1)
     assert not leftover.exists()
+    assert foreign.exists()
     run_attempt(host("quick"), new_job(), 1)
     thread.join()
     assert store.records.job(running).state == JobState.succeeded

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib
 import math
+import os
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -229,3 +231,41 @@ def test_a_device_lock_is_exclusive_and_free_again(tmp_path: Path) -> None:
 def test_the_cpu_needs_no_lock() -> None:
     devices = importlib.import_module("advtex_worker.devices")
     assert devices.acquire("cpu", lambda: True) == ("cpu", None)
+
+
+@pytest.mark.parametrize(("wanted", "taken"), [("auto", "cpu"), ("cuda", "cuda"), ("cuda:3", "cuda:3")])
+def test_without_a_gpu_auto_is_the_cpu_and_the_engine_judges_the_rest(
+    monkeypatch: pytest.MonkeyPatch, wanted: str, taken: str
+) -> None:
+    devices = importlib.import_module("advtex_worker.devices")
+    monkeypatch.setattr(devices.torch.cuda, "is_available", lambda: False)
+    assert devices.acquire(wanted, lambda: False) == (taken, None)
+
+
+class TwoGpus:
+    """What the lock asks of `torch.cuda`."""
+
+    def is_available(self) -> bool:
+        return True
+
+    def device_count(self) -> int:
+        return 2
+
+    def get_device_properties(self, index: int) -> SimpleNamespace:
+        return SimpleNamespace(uuid=f"test-{os.getpid()}-{index}")
+
+
+def test_auto_takes_the_gpu_that_is_free_and_waits_when_none_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    devices = importlib.import_module("advtex_worker.devices")
+    monkeypatch.setattr(devices.torch, "cuda", TwoGpus())
+    monkeypatch.setattr(devices, "POLL_SECONDS", 0.01)
+    first, second = devices.acquire("auto", lambda: False), devices.acquire("auto", lambda: False)
+    assert (first[0], second[0]) == ("cuda:0", "cuda:1")
+    asked = iter([False, False, True])
+    assert devices.acquire("auto", lambda: next(asked)) is None, "a stop is heard while waiting"
+    first[1].close()
+    again = devices.acquire("cuda", lambda: False)
+    assert again[0] == "cuda:0"
+    for lock in (second[1], again[1]):
+        lock.close()
+        Path(lock.name).unlink()

@@ -8,7 +8,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -39,6 +39,7 @@ from advtex_worker.progress import ProgressTracker
 from advtex_worker.settings import WorkerSettings
 
 RETRY_SECONDS = 5.0
+WORKSPACE = "attempt-"  # what the names of workspaces begin with; other folders beside them are nobody's business here
 
 T = TypeVar("T")
 log = structlog.get_logger()
@@ -74,10 +75,17 @@ class Workspace:
     def log(self) -> Path:
         return self.root / "engine.log"
 
-    def make(self) -> None:
-        shutil.rmtree(self.root, ignore_errors=True)
-        for folder in (self.work, self.snapshots, self.out):
-            folder.mkdir(parents=True)
+    @contextmanager
+    def made(self) -> Iterator[None]:
+        """Empty folders, gone at the end. OSError when `sweep` came in between: try again."""
+        self.root.mkdir(parents=True, exist_ok=True)
+        with self.held():
+            try:
+                for folder in (self.work, self.snapshots, self.out):
+                    folder.mkdir()
+                yield
+            finally:
+                shutil.rmtree(self.root, ignore_errors=True)
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -97,7 +105,7 @@ class Workspace:
 
 def sweep(workspaces: Path) -> None:
     """Remove what killed attempts left behind."""
-    for root in workspaces.glob("*/"):
+    for root in workspaces.glob(f"{WORKSPACE}*/"):
         with suppress(OSError), Workspace(root).held():  # BlockingIOError: it is in use
             shutil.rmtree(root, ignore_errors=True)
 
@@ -112,7 +120,7 @@ class Attempt:
         self._job_id = claim.job_id
         self._number = claim.attempt
         self._claim = claim
-        self._space = Workspace(settings.workspaces / f"{claim.job_id}-{claim.attempt}")
+        self._space = Workspace(settings.workspaces / f"{WORKSPACE}{claim.job_id}-{claim.attempt}")
         self._keeper = LeaseKeeper(
             store.records,
             claim.job_id,
@@ -135,8 +143,8 @@ class Attempt:
         self._keeper.start()
         try:
             if not self._persist(lambda: self._store.results.adopt(self._job_id)):
-                self._persist(self._space.make)
-                with self._space.held():
+                with ExitStack() as stack:
+                    self._persist(lambda: stack.enter_context(self._space.made()))
                     self._run()
         except Interrupted:
             self._give_back()
@@ -144,7 +152,6 @@ class Attempt:
             self._log.warning("attempt is stale", reason=str(error))
         finally:
             self._keeper.stop()
-            shutil.rmtree(self._space.root, ignore_errors=True)
 
     def _run(self) -> None:
         try:

@@ -81,10 +81,13 @@ class Child:
 
     def log_tail(self) -> str:
         """The newest lines of what the runner and its libraries printed."""
-        with self._log.open("rb") as file:
-            size = file.seek(0, os.SEEK_END)
-            file.seek(max(0, size - LOG_TAIL_BYTES))
-            return file.read().decode("utf-8", errors="replace")
+        try:
+            with self._log.open("rb") as file:
+                size = file.seek(0, os.SEEK_END)
+                file.seek(max(0, size - LOG_TAIL_BYTES))
+                return file.read().decode("utf-8", errors="replace")
+        except FileNotFoundError:  # the workspace is gone already
+            return ""
 
     def _write(self, line: str) -> None:
         pipe = self._process.stdin

@@ -35,10 +35,10 @@ def acquire(device: str, stop_requested: Callable[[], bool]) -> tuple[str, IO[by
     """(device for torch, its lock) once one is free; None if a stop was requested first.
 
     `auto` is any free GPU, or the CPU where there is none. GPUs are told apart by UUID, since every process may see
-    them under other numbers. The CPU is not locked.
+    them under other numbers. The CPU is not locked, nor is a GPU that is not there: the engine says so.
     """
-    if device == "cpu" or (device == "auto" and not torch.cuda.is_available()):
-        return "cpu", None
+    if device == "cpu" or not torch.cuda.is_available():
+        return "cpu" if device == "auto" else device, None
     wanted = range(torch.cuda.device_count()) if device == "auto" else [int(device.partition(":")[2] or 0)]
     paths = {f"cuda:{i}": lock_path(f"gpu-{torch.cuda.get_device_properties(i).uuid}") for i in wanted}
     while not stop_requested():

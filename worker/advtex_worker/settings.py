@@ -13,7 +13,7 @@ from advtex_store.settings import StoreSettings
 class WorkerSettings(StoreSettings):
     """Settings of one worker.
 
-    work_dir: scratch space of running attempts, `<data_dir>/work` by default; emptied when a worker starts.
+    work_dir: scratch space of running attempts, `<data_dir>/work` by default.
     """
 
     device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="where the engine computes")

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from sqlalchemy import delete, select, update
 from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.orm import Session
 
 from advtex_contract.errors import ErrorDetail
 from advtex_contract.jobs import JobError, JobSpec, JobState, Progress
@@ -100,6 +101,8 @@ class Submissions:
             if upload is None:
                 raise RecordNotFound(f"there is no finished upload {spec.upload_id}")
             now = self.database.now(session)
+            # Also keeps a reconciler that is just letting the upload go from doing so: it looks at this time again.
+            upload.expires_at = max(upload.expires_at or 0.0, now + self.retention_seconds)
             state = JobState.rejected if rejection else JobState.queued
             row = JobRow(
                 id=new_id(now),
@@ -129,15 +132,7 @@ class Submissions:
                 )
             )
             if reservation is not None:
-                bound = session.execute(
-                    update(IdempotencyRow)
-                    .where(IdempotencyRow.owner == owner, IdempotencyRow.token == reservation.token)
-                    .where(IdempotencyRow.holder == reservation.holder, IdempotencyRow.job_id.is_(None))
-                    .values(job_id=row.id)
-                    .returning(IdempotencyRow.token)
-                ).first()
-                if bound is None:
-                    raise IdempotencyInFlight(f"another request took over the idempotency key {reservation.token!r}")
+                _bind(session, reservation, row.id)
             return row
 
     def list_jobs(
@@ -160,3 +155,15 @@ class Submissions:
         with self.database.read() as session:
             rows = list(session.scalars(query.order_by(JobRow.id.desc()).limit(limit + 1)))
         return rows[:limit], rows[limit - 1].id if len(rows) > limit else None
+
+
+def _bind(session: Session, reservation: Reservation, job_id: str) -> None:
+    bound = session.scalar(
+        update(IdempotencyRow)
+        .where(IdempotencyRow.owner == reservation.owner, IdempotencyRow.token == reservation.token)
+        .where(IdempotencyRow.holder == reservation.holder, IdempotencyRow.job_id.is_(None))
+        .values(job_id=job_id)
+        .returning(IdempotencyRow.token)
+    )
+    if bound is None:
+        raise IdempotencyInFlight(f"another request took over the idempotency key {reservation.token!r}")

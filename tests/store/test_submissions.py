@@ -20,6 +20,13 @@ def test_a_job_needs_a_finished_upload_of_its_owner(bench: Any) -> None:
             bench.submissions.create_job(bench.owner, JobSpec(upload_id=upload_id))
 
 
+def test_a_job_renews_its_upload(bench: Any) -> None:
+    upload = bench.finished_upload()
+    bench.clock.now += 900
+    bench.submissions.create_job(bench.owner, JobSpec(upload_id=upload))
+    assert bench.uploads.upload(upload).expires_at == bench.clock.now + 1000
+
+
 def test_a_rejected_job_is_recorded_and_never_waits(bench: Any) -> None:
     spec = JobSpec(upload_id=bench.finished_upload())
     row = bench.submissions.create_job(bench.owner, spec, rejection=JobError(code="invalid_scan", message="no mesh"))

@@ -15,7 +15,7 @@ import typer
 from pydantic import ValidationError
 
 from advtex_client._calls import ensure_succeeded
-from advtex_client._display import Display, job_lines, job_table
+from advtex_client._display import Display, finding_lines, job_lines, job_table
 from advtex_client.client import Client
 from advtex_client.errors import (
     AuthError,
@@ -124,6 +124,8 @@ def submit(
         with Client(url, api_key) as client:
             with display.bytes_bar("sending") as bar:
                 job = client.submit(scan, options, label=label, new=new, on_bytes=bar.upload)
+            for line in finding_lines(job.warnings):
+                display.note(line)
             if job.state in TERMINAL:
                 again = f"`advtex-client retry {job.id}` or " if job.state in RETRYABLE else ""
                 display.note(f"this scan was submitted before: job {job.id} {job.state}; {again}--new does it again")

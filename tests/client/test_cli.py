@@ -181,11 +181,14 @@ def test_a_job_in_words() -> None:
 
 def test_submitting_a_finished_scan_again_says_so(server: FakeServer, scan: Path) -> None:
     run("submit", scan)
-    server.jobs["j0"] = view("j0", JobState.failed, error=JobError(code="x", message="no paint"))
+    warning = ErrorDetail(severity="warning", where="pose.txt", message="2 frames dropped", remedy="fix them")
+    error = JobError(code="x", message="no paint")
+    server.jobs["j0"] = view("j0", JobState.failed, error=error, warnings=[warning])
     again = run("submit", scan)
     assert (again.exit_code, again.stdout) == (0, "j0\n")
     assert "retry j0" in again.stderr
     assert "--new" in again.stderr
+    assert "warning: pose.txt: 2 frames dropped -> fix them" in again.stderr
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(0.4, "0 s"), (59.4, "59 s"), (60, "1 min 0 s"), (7500, "2 h 5 min")])

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import cast
 
-from advtex_scan.manifest import Matrix4
+from advtex_scan.manifest import Matrix4, UpAxis
 
 ROTATION_TOLERANCE = 0.01  # largest entry of |R Rᵀ - I|; six printed digits (ScanNet) give about 1e-6
 
@@ -54,6 +54,18 @@ def pose_problem(transform: Matrix4) -> str | None:
 def is_lost(transform: Matrix4) -> bool:
     """True for the mark of lost tracking (ScanNet, BundleFusion): nothing in the upper rows is finite."""
     return not any(math.isfinite(value) for row in transform[:3] for value in row)
+
+
+def up_axis_of(poses: Iterable[Matrix4]) -> UpAxis:
+    """The world axis nearest to where camera_to_world poses (OpenCV axes) have their upper side on average.
+
+    For layouts whose world has no stated up direction: people hold a camera upright more often than not. "+z" without a
+    finite pose.
+    """
+    ups = [[-row[1] for row in pose[:3]] for pose in poses if not pose_problem(pose)]
+    mean = [sum(axis) for axis in zip(*ups, strict=True)] if ups else [0.0, 0.0, 1.0]
+    index = max(range(3), key=lambda axis: abs(mean[axis]))
+    return cast(UpAxis, ("+" if mean[index] > 0 else "-") + "xyz"[index])
 
 
 def _dot(a: Sequence[float], b: Sequence[float]) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from advtex_scan import ByteRange, Intrinsics, open_scan, read_scan
+from advtex_scan.matrices import matrix4, up_axis_of
 
 K = (30.0, 31.0, 15.5, 11.5)  # as files write it: the first pixel's centre at (0, 0)
 EXPECTED = Intrinsics(30.0, 31.0, 16.0, 12.0, 32, 24)
@@ -290,3 +291,20 @@ def test_which_mesh_is_taken(seven, make, names, chosen):
         ambiguous = [finding for finding in found.report.findings if finding.code == "ambiguous_mesh"]
         assert all(name in ambiguous[0].message for name in names)
         assert "no_mesh" not in {finding.code for finding in found.report.findings}
+
+
+@pytest.mark.parametrize("up", ["+x", "-x", "+y", "-y", "+z", "-z"])
+def test_the_up_axis_of_a_world_without_one_is_where_cameras_have_their_upper_side(up: str) -> None:
+    down = -np.eye(3)["xyz".index(up[1])] * (1 if up[0] == "+" else -1)
+    side = np.roll(down, 1)
+    poses = []
+    for tilt in (-0.5, 0.1, 0.4):
+        pose = np.eye(4)
+        forward = np.cross(side, down)
+        pose[:3, 1] = np.cos(tilt) * down + np.sin(tilt) * forward
+        pose[:3, 0] = side
+        pose[:3, 2] = np.cross(pose[:3, 0], pose[:3, 1])
+        poses.append(matrix4(pose.flatten().tolist()))
+    lost = matrix4([float("-inf")] * 16)
+    assert up_axis_of([*poses, lost]) == up
+    assert up_axis_of([lost]) == "+z"

@@ -22,7 +22,7 @@ from advtex_scan.images import read_image_header
 from advtex_scan.layouts._mesh_choice import choose_mesh
 from advtex_scan.layouts._reader import IMAGE_SUFFIXES, Match, ScanReader, parse_numbers
 from advtex_scan.manifest import FrameEntry, Intrinsics, Matrix4, ScanManifest
-from advtex_scan.matrices import invert_rigid
+from advtex_scan.matrices import invert_rigid, up_axis_of
 
 NAME = "mvs_cam"
 INTRINSICS_FILE = "intrinsics.txt"
@@ -46,10 +46,12 @@ def read(reader: ScanReader) -> ScanManifest | None:
     colors = sorted({stem for stem in by_stem if "color" in PurePosixPath(stem).name} | set(cams))
     reader.frames_found = len(colors)
     frames = [_frame(reader, stem, by_stem, cams.get(stem), cameras) for stem in colors]
+    usable = tuple(sorted((frame for frame in frames if frame), key=lambda frame: frame.name))
     return ScanManifest(
         layout=NAME,
-        frames=tuple(sorted((frame for frame in frames if frame), key=lambda frame: frame.name)),
+        frames=usable,
         mesh=choose_mesh(reader, ("mesh.ply",)),
+        up_axis=up_axis_of(frame.camera_to_world for frame in usable),
     )
 
 

@@ -18,7 +18,7 @@ from advtex_scan.archive import ScanArchive
 from advtex_scan.layouts._mesh_choice import choose_mesh
 from advtex_scan.layouts._reader import Match, ScanReader, parse_numbers, parse_settings, parse_size
 from advtex_scan.manifest import IDENTITY, FrameEntry, Intrinsics, Matrix4, ScanManifest
-from advtex_scan.matrices import compose, invert_rigid
+from advtex_scan.matrices import compose, invert_rigid, up_axis_of
 
 NAME = "seven_scenes"
 FRAME = re.compile(r"((?:.*/)?frame-\d+)\.(color|depth|pose)\.(jpg|jpeg|png|txt)")
@@ -58,11 +58,13 @@ def read(reader: ScanReader) -> ScanManifest | None:
         remedy = f"add {COLOR_FILES[0]} or {COMMON_FILE} with the 3x3 matrix"
         reader.findings.error("no_color_intrinsics", "", "there are no color intrinsics", remedy)
     depth_to_color = _depth_to_color(reader)
-    entries = (_entry(reader, name, frame, color, depth, depth_to_color) for name, frame in frames.items())
+    entries = [_entry(reader, name, frame, color, depth, depth_to_color) for name, frame in frames.items()]
+    usable = tuple(entry for entry in entries if entry)
     return ScanManifest(
         layout=NAME,
-        frames=tuple(entry for entry in entries if entry),
+        frames=usable,
         mesh=choose_mesh(reader, ("mesh.ply",)),
+        up_axis=up_axis_of(frame.camera_to_world for frame in usable),
         depth_scale=_depth_scale(reader, info),
         depth_to_color=depth_to_color or IDENTITY,
     )

@@ -182,6 +182,18 @@ def test_the_pyramid_starts_small_and_ends_at_full_size(scan: Path, tmp_path: Pa
     assert recorder.steps[-1] == STEPS
 
 
+@pytest.mark.parametrize("stop_at", [7, 21])
+def test_a_pyramid_that_is_stopped_at_either_level_resumes_to_the_same_bytes(
+    scan: Path, tmp_path: Path, stop_at: int
+) -> None:
+    config = TextureConfig(preset="preview", steps=STEPS, face_budget=4000, device="cpu")
+    texture_scan(scan, tmp_path / "whole", config, work=tmp_path / "work")
+    with pytest.raises(Stopped, match=f"step {stop_at} of"):
+        texture_scan(scan, tmp_path / "two", config, work=tmp_path / "work2", monitor=Recorder(stop_at=stop_at))
+    texture_scan(scan, tmp_path / "two", config, work=tmp_path / "work2", resume=True)
+    assert (tmp_path / "whole" / "model.png").read_bytes() == (tmp_path / "two" / "model.png").read_bytes()
+
+
 def test_the_average_method_takes_no_steps(scan: Path, tmp_path: Path) -> None:
     config = TextureConfig(method="average", face_budget=4000, device="cpu")
     result = texture_scan(scan, tmp_path, config, work=tmp_path / "work", monitor=Recorder())

@@ -59,8 +59,9 @@ def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
             discriminator=discriminator,
         )
         optimizer.index = run.step
-        if saved and number == run.level:
+        if saved:
             optimizer.load_state_dict(saved["optimizer"])
+            saved = None
         _run_level(given, optimizer, run, sum(part.steps for part in preset.levels[: number + 1]), timer)
         texture = dense_texture(maps, (optimizer.values.detach() + 1) / 2)
         run.level = number + 1

@@ -245,10 +245,14 @@ class FolderBlobs(Blobs):
         return BlobInfo(key, stat.st_size, f"{stat.st_mtime_ns:x}-{stat.st_size:x}-{stat.st_ino:x}")
 
     def list(self, prefix: str) -> Iterator[BlobInfo]:
-        folder = self.path(check_prefix(prefix))
-        for path in sorted(folder.rglob("*"), key=lambda p: p.as_posix()):
+        # os.walk passes over folders that vanish while it lists: others delete meanwhile.
+        walk = os.walk(self.path(check_prefix(prefix)))
+        paths = sorted(
+            Path(folder, name).relative_to(self.root).as_posix() for folder, _, names in walk for name in names
+        )
+        for key in paths:
             with suppress(BlobNotFound):
-                yield self.head(path.relative_to(self.root).as_posix())
+                yield self.head(key)
 
     def delete(self, key: str) -> None:
         path = self.path(key)

@@ -21,7 +21,7 @@ PRESET = dataclasses.replace(PRESETS["standard"], l1_decays=4)
 
 def optimizer(seed: int = 0, steps: int = 20) -> AdversarialOptimizer:
     maps, pairs = planar_views(4, WIDTH, HEIGHT, 1.2, torch.device("cpu"))
-    start = torch.rand(maps.slots, 3, generator=torch.Generator().manual_seed(5)) * 2 - 1
+    start = torch.rand(maps.slots, 3, generator=torch.Generator().manual_seed(5))
     network = PatchDiscriminator(torch.Generator().manual_seed(seed))
     generator = torch.Generator().manual_seed(seed)
     return AdversarialOptimizer(
@@ -93,7 +93,7 @@ def test_one_step_is_adam_on_the_printed_losses() -> None:
 
         width, height = of.crop
         fake = (values[batch.slots.long()] * batch.weights[..., None]).sum(1)
-        fake = fake.view(1, height, width, 3).permute(0, 3, 1, 2)
+        fake = fake.view(1, height, width, 3).permute(0, 3, 1, 2) * 2 - 1
         masks = patch_masks(batch.foreground, batch.visible)
         fake_logits = twin_network(batch.condition, (fake - batch.condition) * batch.visible)
         real_logits = twin_network(batch.condition, (batch.real - batch.condition) * batch.visible)

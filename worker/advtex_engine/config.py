@@ -26,7 +26,7 @@ class Preset:
 
     levels            coarse-to-fine schedule; one level for everything but `preview`
     start             "zero" (paper) or "mean" (texture starts as the projected average)
-    lr_texture        1e-3, Adam
+    lr_texture        1e-3, Adam; colors in [0, 1]
     lr_discriminator  1e-4, Adam
     beta1             0.5
     l1_weight         lambda = 10 at the start

@@ -3,7 +3,8 @@
 One step: draw a source view A and an auxiliary view B; warp B into A (real); render the texture at A (fake); let the
 discriminator judge [I_A, real - I_A] and [I_A, fake - I_A]; update both players from the same forward passes.
 
-Colors are in [-1, 1]. Pixels that B does not see carry a zero residual in the real and in the fake example alike, so
+The texture's values are in [0, 1], so that its learning rate is in those units; the networks see colors in [-1, 1].
+Pixels that B does not see carry a zero residual in the real and in the fake example alike, so
 that the discriminator cannot tell them apart by their holes. All draws come from one generator on the device, and
 nothing in `step` waits for the device: the crop's size is fixed and only its offset is drawn, a skipped discriminator
 update is a flag that Adam's kernel reads. On a CPU, where a branch costs nothing, the skipped gradient is not computed.
@@ -68,7 +69,7 @@ def crop_size(width: int, height: int) -> tuple[int, int]:
 class AdversarialOptimizer:
     """State and step of one optimization over fixed view maps.
 
-    values: start of the compact texture, [slots,3] float32 in [-1,1]. steps: the whole run's length, which the decay of
+    values: start of the compact texture, [slots,3] float32 in [0,1]. steps: the whole run's length, which the decay of
     lambda is scaled to; `index` counts the steps over all levels of a pyramid.
     """
 
@@ -154,7 +155,7 @@ class AdversarialOptimizer:
     def play(self, batch: Batch) -> Losses:
         """Renders the fake example and lets the discriminator judge both; one fake forward pass serves both players."""
         masks = patch_masks(batch.foreground, batch.visible)
-        fake = self._image(sample_texels(self.values, batch.slots, batch.weights))
+        fake = self._image(sample_texels(self.values, batch.slots, batch.weights)) * 2 - 1
         with self._autocast():
             fake_logits = self.discriminator(batch.condition, (fake - batch.condition) * batch.visible).float()
             real_logits = self.discriminator(batch.condition, (batch.real - batch.condition) * batch.visible).float()

@@ -63,7 +63,7 @@ def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
             optimizer.load_state_dict(saved["optimizer"])
             saved = None
         _run_level(given, optimizer, run, sum(part.steps for part in preset.levels[: number + 1]), timer)
-        texture = dense_texture(maps, (optimizer.values.detach() + 1) / 2)
+        texture = dense_texture(maps, optimizer.values.detach())
         run.level = number + 1
     return texture.clamp(0, 1), run.losses
 
@@ -93,15 +93,15 @@ def _run_level(
 
 
 def _start(given: MethodInput) -> Tensor:
-    """The first level's dense start in [0,1]; the paper's zero start is mid-gray in the optimizer's [-1,1]."""
+    """The first level's dense start in [0,1]."""
     first = given.averages[given.preset.levels[0].scale]
-    return torch.full_like(first, 0.5) if given.preset.start == "zero" else first
+    return torch.zeros_like(first) if given.preset.start == "zero" else first
 
 
 def _compact(maps: ViewMaps, texture: Tensor) -> Tensor:
-    """Rows [slots,3] in [-1,1] of a dense texture [H,W,3] in [0,1], resampled to the maps' texture size."""
+    """Rows [slots,3] of a dense texture [H,W,3], resampled to the maps' texture size."""
     height, width = maps.slot_map.shape
     image = texture.permute(2, 0, 1)[None]
     if texture.shape[:2] != (height, width):
         image = F.interpolate(image, (height, width), mode="bilinear", align_corners=False)
-    return image[0].permute(1, 2, 0)[maps.slot_map >= 0] * 2 - 1
+    return image[0].permute(1, 2, 0)[maps.slot_map >= 0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -16,14 +17,17 @@ from typing import Any
 
 import psutil
 import pytest
+import redis
 import yaml
 from live_service import process_tree, wait_until
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
+from rq import Worker
 from tiny_scan import write_scan, write_zip
 
 from advtex_server.settings import ServerSettings
+from advtex_store.queue import QUEUE
 from advtex_store.settings import StoreSettings
 from advtex_worker.settings import WorkerSettings
 
@@ -123,6 +127,25 @@ class TestImages:
     def test_the_context_holds_what_is_copied(self) -> None:
         kept = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
         assert kept == {*ROOMS, "pyproject.toml", "constraints.txt", "README.md", "LICENSE"}
+
+    def test_a_worker_is_healthy_while_redis_knows_it(self, redis_url: str, tmp_path: Path) -> None:
+        text = (ROOT / "docker" / "worker.Dockerfile").read_text()
+        check = re.search(r"^HEALTHCHECK.*\n +CMD (\[.*\])$", text, re.MULTILINE)
+        assert check is not None
+        environment = dict(os.environ) | {"ADVTEX_REDIS_URL": redis_url, "ADVTEX_DATA_DIR": str(tmp_path)}
+
+        def exit_code() -> int:
+            command = [sys.executable, *json.loads(check[1])[1:]]
+            return subprocess.run(command, env=environment, stderr=subprocess.PIPE, timeout=60, check=False).returncode
+
+        assert exit_code() == 1
+        with redis.Redis.from_url(redis_url) as connection:
+            worker = Worker([QUEUE], connection=connection)
+            worker.register_birth()
+            assert exit_code() == 0
+            worker.register_death()
+            connection.delete(worker.key)
+        assert exit_code() == 1
 
 
 class TestCompose:

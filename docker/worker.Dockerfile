@@ -2,7 +2,8 @@
 # A worker with the engine: docker build -f docker/worker.Dockerfile .
 #
 # The base is plain Python: PyTorch's wheel brings the CUDA libraries that it was built with, so a CUDA base image would
-# only hold them twice. The host needs NVIDIA's driver and container toolkit. Without a GPU the same image uses the CPU.
+# only hold them twice. The host needs NVIDIA's container toolkit and a driver for CUDA 13 (580 or newer). Without a GPU
+# the same image uses the CPU.
 FROM python:3.12.11-slim-bookworm AS build
 RUN python -m venv /opt/advtex
 WORKDIR /src

@@ -102,6 +102,10 @@ class TestPackages:
         assert "advtex_scan.upwards -> advtex_engine" in done.stdout
 
 
+def test_shellcheck_finds_nothing() -> None:
+    assert tool("shellcheck", *(ROOT / ".ci").iterdir()).returncode == 0
+
+
 class TestImages:
     @pytest.mark.parametrize("file", DOCKERFILES, ids=lambda file: file.stem)
     def test_hadolint_finds_nothing(self, file: Path) -> None:

@@ -37,11 +37,18 @@ def test_defaults_suit_most_scans() -> None:
     ],
 )
 def test_bounds_of_options(name: str, low: int, high: int) -> None:
+    both = {"width": 100, "height": 100} if name in ("width", "height") else {}
     for value in (low, high):
-        assert getattr(JobOptions.model_validate({name: value}), name) == value
+        assert getattr(JobOptions.model_validate(both | {name: value}), name) == value
     for value in (low - 1, high + 1, low + 0.5, "many"):
         with pytest.raises(ValidationError, match=name):
-            JobOptions.model_validate({name: value})
+            JobOptions.model_validate(both | {name: value})
+
+
+@pytest.mark.parametrize("side", ["width", "height"])
+def test_half_a_size_is_refused(side: str) -> None:
+    with pytest.raises(ValidationError, match="width and height go together"):
+        JobOptions.model_validate({side: 100})
 
 
 @pytest.mark.parametrize("options", [{"preset": "fastest"}, {"stpes": 3}])

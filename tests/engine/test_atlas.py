@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 import pytest
 import torch
@@ -11,7 +9,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from advtex_engine.atlas import PADDING, SIZE_STEP, build_atlas, covered_texels, texel_coverage, why_not_kept
+from advtex_engine.atlas import PADDING, SIZE_STEP, build_atlas, texel_coverage, why_not_kept
 from advtex_engine.config import TextureConfig
 from advtex_engine.density import face_areas, pixel_density
 from advtex_engine.errors import OptionError, Problem, ScanError
@@ -327,44 +325,6 @@ def test_coverage_of_centers_counts_each_once_across_shared_edges() -> None:
     counts = texel_coverage(mesh.v_uv[mesh.t_uv_idx].double().numpy() * 64, 64, 64, reach=0.0)
     assert (counts > 0).all()
     assert (counts == 1).mean() > 0.97
-
-
-@given(st.integers(0, 2**31))
-@settings(max_examples=10, deadline=None)
-def test_bilinear_sampling_touches_covered_texels_only(seed: int) -> None:
-    """Random surface points, in float32 as a renderer would interpolate them."""
-    atlas = sampled_atlas()
-    covered = covered_texels(atlas)
-    assert covered.shape == (atlas.height, atlas.width)
-    torch.manual_seed(seed)
-    assert atlas.mesh.v_uv is not None
-    assert atlas.mesh.t_uv_idx is not None
-    face = torch.randint(len(atlas.mesh.t_uv_idx), (50_000,))
-    weights = (
-        torch.distributions.Dirichlet(torch.full((3,), 0.3)).sample((50_000,)) if seed % 2 else torch.eye(3)[face % 3]
-    )
-    uv = (atlas.mesh.v_uv[atlas.mesh.t_uv_idx[face]] * weights[..., None]).sum(dim=1)
-    corner = (uv * torch.tensor([atlas.width, atlas.height]) - 0.5).floor().long()
-    fraction = uv * torch.tensor([atlas.width, atlas.height]) - 0.5 - corner
-    for dx in (0, 1):
-        for dy in (0, 1):
-            weight = (fraction[:, 0] - (1 - dx)).abs() * (fraction[:, 1] - (1 - dy)).abs()
-            x, y = (corner[:, 0] + dx).clamp(0, atlas.width - 1), (corner[:, 1] + dy).clamp(0, atlas.height - 1)
-            assert covered[y, x][weight > 1e-4].all()
-
-
-@functools.cache
-def sampled_atlas() -> Atlas:
-    return build_atlas(bumpy_sphere(2), AROUND, TextureConfig(), Listener())
-
-
-def test_covered_texels_are_few_beyond_the_charts() -> None:
-    atlas = sampled_atlas()
-    covered = covered_texels(atlas)
-    inside = texel_coverage(texel_corners(atlas), atlas.width, atlas.height, reach=0.0) > 0
-    assert covered[torch.from_numpy(inside)].all()
-    grown = torch.nn.functional.max_pool2d(torch.from_numpy(inside).float()[None], 5, 1, 2)[0] > 0
-    assert (covered & ~grown).sum() < 0.01 * covered.sum()
 
 
 # Density

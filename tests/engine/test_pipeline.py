@@ -14,10 +14,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from advtex_engine.checkpoint import WorkFolder
 from advtex_engine.config import PRESETS, TextureConfig
 from advtex_engine.errors import OptionError, Problem, ScanError, Stopped
 from advtex_engine.monitor import STAGES, Monitor
 from advtex_engine.pipeline import choose_device, resolve_preset, texture_scan
+from advtex_engine.report import Stages, WarningKeeper
 from advtex_engine.synthesize import synthesize
 
 STEPS = 24
@@ -169,6 +171,22 @@ def test_a_terminated_run_leaves_a_checkpoint_and_its_exit_code_says_so(scan: Pa
     assert "resume goes on from there" in errors
     assert time.monotonic() - started < 10
     assert (tmp_path / "work" / "checkpoint.pt").exists()
+
+
+def test_a_resumed_run_keeps_the_warnings_of_stages_that_it_takes_over(tmp_path: Path) -> None:
+    problem = Problem("odd", "mesh", "is odd", "look at it")
+    first = WarningKeeper(Monitor())
+    stages = Stages(first, WorkFolder(tmp_path, "run", first))
+    for stage in ("ingest", "atlas"):
+        with stages.run(stage):
+            first.warning(problem)
+    stages.save()
+    again = WarningKeeper(Monitor())
+    resumed = Stages(again, WorkFolder(tmp_path, "run", again))
+    resumed.restore("ingest")
+    assert [warning["stage"] for warning in again.warnings] == ["ingest"]
+    assert [record["stage"] for record in resumed.records] == ["ingest"]
+    assert again.warnings[0]["remedy"] == "look at it"
 
 
 def test_the_pyramid_starts_small_and_ends_at_full_size(scan: Path, tmp_path: Path) -> None:

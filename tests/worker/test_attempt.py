@@ -105,15 +105,6 @@ def test_an_error_that_would_come_again_fails_the_job(
     assert ("Traceback" in row.error["log_tail"]) == (code != "invalid_options")
 
 
-def test_half_a_size_is_refused_as_an_option(store: Store, host: Hosts, new_job: NewJob) -> None:
-    job_id = new_job(width=320)
-    run_attempt(host("quick"), job_id, 1)
-    error = store.records.job(job_id).error
-    assert error is not None
-    assert error["code"] == "invalid_options"
-    assert "width and height" in error["message"]
-
-
 def test_a_bad_scan_is_rejected_with_every_problem(store: Store, host: Hosts, new_job: NewJob) -> None:
     job_id = new_job()
     run_attempt(host("rejects"), job_id, 1)

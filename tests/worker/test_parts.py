@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 from advtex_contract.jobs import Progress
 from advtex_contract.options import JobOptions, Preset
 from advtex_engine import config as engine
-from advtex_engine.errors import OptionError
 from advtex_engine.monitor import STAGES
 from advtex_store.errors import StaleAttempt
 from advtex_store.queue import TASK
@@ -88,11 +87,6 @@ def test_every_option_arrives(
     assert (config.preset, config.size, config.holdout, config.seed) == (preset.value, (width, height), holdout, seed)
     assert (config.steps, config.device, config.max_texture_size) == (9, "cuda:1", options.max_texture_size)
     assert config.face_budget == (engine.TextureConfig().face_budget if face_budget is None else face_budget)
-
-
-def test_half_a_size_is_an_option_error() -> None:
-    with pytest.raises(OptionError, match="width and height"):
-        texture_config(JobOptions(height=100), "cpu")
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 import torch
 import xatlas
-from torch import Tensor
 
 from advtex_engine.config import TextureConfig
 from advtex_engine.density import face_areas, pixel_density
@@ -252,16 +251,6 @@ def _cap(config: TextureConfig) -> int:
 
 
 # Texture space --------------------------------------------------------------------------------------------------------
-
-
-def covered_texels(atlas: Atlas) -> Tensor:
-    """[H,W] bool: every texel that bilinear sampling may touch at any point of the surface.
-
-    A sample touches the texels whose centers are less than one texel away along both axes, so a texel counts if the
-    2x2 square around its center meets a uv triangle.
-    """
-    corners = _uv_corners(atlas.mesh) * np.array([atlas.width, atlas.height])
-    return torch.from_numpy(texel_coverage(corners, atlas.width, atlas.height, reach=1.0) > 0)
 
 
 def _uv_corners(mesh: Mesh) -> Floats:

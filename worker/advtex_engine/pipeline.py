@@ -19,7 +19,7 @@ from advtex_engine.atlas import build_atlas
 from advtex_engine.cameras import scaled_camera
 from advtex_engine.checkpoint import WorkFolder
 from advtex_engine.config import PRESETS, Preset, PyramidLevel, TextureConfig
-from advtex_engine.errors import OptionError, Problem
+from advtex_engine.errors import OptionError
 from advtex_engine.export import export_model
 from advtex_engine.geometry import clean, decimate
 from advtex_engine.ingest import ingest
@@ -28,6 +28,7 @@ from advtex_engine.methods.average import average_texture
 from advtex_engine.monitor import Monitor
 from advtex_engine.report import (
     Stages,
+    WarningKeeper,
     describe_scene,
     heldout_scores,
     scene_from_dict,
@@ -59,7 +60,7 @@ def texture_scan(
     """
     device = choose_device(config.device)
     preset = resolve_preset(config, device)
-    monitor = _Collecting(monitor or Monitor())
+    monitor = WarningKeeper(monitor or Monitor())
     folder = WorkFolder(work, fingerprint(scan, config), monitor)
     if not resume:
         folder.clear()
@@ -198,40 +199,13 @@ def shrink(view: View, scale: int) -> View:
     return View(view.name, camera, color, depth)
 
 
-class _Collecting(Monitor):
-    """Passes everything on and keeps the warnings for the report."""
-
-    def __init__(self, inner: Monitor) -> None:
-        self.inner = inner
-        self.warnings: list[Problem] = []
-
-    def stage_started(self, stage: str) -> None:
-        self.inner.stage_started(stage)
-
-    def stage_finished(self, stage: str, seconds: float, peak_memory_bytes: int) -> None:
-        self.inner.stage_finished(stage, seconds, peak_memory_bytes)
-
-    def progress(self, step: int, steps: int, losses: Mapping[str, float]) -> None:
-        self.inner.progress(step, steps, losses)
-
-    def warning(self, problem: Problem) -> None:
-        self.warnings.append(problem)
-        self.inner.warning(problem)
-
-    def checkpointed(self, files: tuple[Path, ...]) -> None:
-        self.inner.checkpointed(files)
-
-    def stop_requested(self) -> bool:
-        return self.inner.stop_requested()
-
-
 def _mesh_to(mesh: Mesh, device: torch.device) -> Mesh:
     uv = None if mesh.v_uv is None or mesh.t_uv_idx is None else (mesh.v_uv.to(device), mesh.t_uv_idx.to(device))
     return Mesh(mesh.v_pos.to(device), mesh.t_pos_idx.to(device), *(uv or ()))
 
 
 def _report(
-    run: _Collecting, config: TextureConfig, preset: Preset, device: torch.device, parts: Mapping[str, Any]
+    run: WarningKeeper, config: TextureConfig, preset: Preset, device: torch.device, parts: Mapping[str, Any]
 ) -> dict[str, Any]:
     """report.json: what went in, what was done with it, what it cost."""
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
@@ -240,6 +214,6 @@ def _report(
         "device": f"{device.type} ({name}, {torch.get_num_threads()} threads)",
         "options": asdict(config),
         "preset": asdict(preset),
-        "warnings": [asdict(problem) for problem in run.warnings],
+        "warnings": run.warnings,
         **parts,
     }

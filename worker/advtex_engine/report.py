@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from advtex_engine.checkpoint import WorkFolder
-from advtex_engine.errors import Stopped
+from advtex_engine.errors import Problem, Stopped
 from advtex_engine.files import write_atomically
 from advtex_engine.metrics import score_views
 from advtex_engine.monitor import Monitor
@@ -36,14 +36,47 @@ def peak_memory_bytes() -> int:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
-class Stages:
-    """Times the stages and tells the monitor; `records` go into the report. A resumed run keeps the first run's."""
+class WarningKeeper(Monitor):
+    """Passes everything on to the host's monitor and keeps the warnings, each with its stage."""
 
-    def __init__(self, monitor: Monitor, folder: WorkFolder) -> None:
+    def __init__(self, inner: Monitor) -> None:
+        self.inner = inner
+        self.warnings: list[dict[str, str]] = []
+        self.stage = ""
+
+    def stage_started(self, stage: str) -> None:
+        self.stage = stage
+        self.inner.stage_started(stage)
+
+    def stage_finished(self, stage: str, seconds: float, peak_memory_bytes: int) -> None:
+        self.inner.stage_finished(stage, seconds, peak_memory_bytes)
+
+    def progress(self, step: int, steps: int, losses: Mapping[str, float]) -> None:
+        self.inner.progress(step, steps, losses)
+
+    def warning(self, problem: Problem) -> None:
+        self.warnings.append({"stage": self.stage, **asdict(problem)})
+        self.inner.warning(problem)
+
+    def checkpointed(self, files: tuple[Path, ...]) -> None:
+        self.inner.checkpointed(files)
+
+    def stop_requested(self) -> bool:
+        return self.inner.stop_requested()
+
+
+class Stages:
+    """Times the stages and tells the monitor; `records` go into the report.
+
+    A resumed run keeps the records and warnings of the stages whose result it takes over.
+    """
+
+    def __init__(self, monitor: WarningKeeper, folder: WorkFolder) -> None:
         self.monitor, self.folder = monitor, folder
         self.records: list[dict[str, Any]] = []
         saved = folder.load("stages")
         self._saved = {record["stage"]: record for record in saved["records"]} if saved else {}
+        self._saved_warnings = saved["warnings"] if saved else []
 
     @contextmanager
     def run(self, stage: str) -> Iterator[None]:
@@ -62,14 +95,15 @@ class Stages:
     def restore(self, *stages: str) -> None:
         """Takes over the records of stages whose result was found in the work folder."""
         self.records += [{**self._saved[stage], "resumed": True} for stage in stages if stage in self._saved]
+        self.monitor.warnings += [warning for warning in self._saved_warnings if warning["stage"] in stages]
 
     def save(self) -> None:
-        self.folder.save("stages", {"records": self.records})
+        self.folder.save("stages", {"records": self.records, "warnings": self.monitor.warnings})
 
 
 def versions() -> dict[str, str]:
     """Versions of what decides the result."""
-    names = ("advtex", "torch", "numpy", "opencv-python-headless", "trimesh", "xatlas", "fast-simplification")
+    names = ("advtex", "torch", "numpy", "opencv-python-headless", "xatlas", "fast-simplification")
     found = {"python": platform.python_version()}
     for name in names:
         try:

@@ -6,13 +6,10 @@ from dataclasses import replace
 
 from advtex_contract.options import JobOptions
 from advtex_engine.config import TextureConfig
-from advtex_engine.errors import OptionError
 
 
 def texture_config(options: JobOptions, device: str) -> TextureConfig:
     """What the engine is asked to do. Raises OptionError."""
-    if (options.width is None) != (options.height is None):
-        raise OptionError("only one of width and height is set; give both, or none to keep the scan's own size")
     size = (options.width, options.height) if options.width and options.height else None
     config = TextureConfig(
         preset=options.preset.value,

@@ -53,7 +53,7 @@ def optimize(picture: Tensor, steps: int, *, auxiliary: bool, seed: int = 0) -> 
         maps,
         planar_pairs(VIEWS, torch.device("cpu"), auxiliary=auxiliary),
         start[maps.slot_map >= 0],
-        PRESETS["standard"],
+        PRESETS["full"],
         kind="scene",
         steps=steps,
         generator=torch.Generator().manual_seed(seed),

@@ -55,8 +55,8 @@ class Preset:
 PRESETS: dict[str, Preset] = {
     "paper": Preset(levels=(PyramidLevel(50_000),), start="zero"),
     "full": Preset(levels=(PyramidLevel(50_000),), start="mean"),
-    # In so few steps the discriminator learns little: with lambda falling to nothing, flat walls turn noisy (a kitchen at
-    # 320x240: LPIPS of held-out views .382, averaging .357; with the printed decay per 1,000 steps .343).
+    # In so few steps the discriminator learns little: with lambda falling to nothing, flat walls turn noisy (a kitchen
+    # at 320x240: LPIPS of held-out views .382, averaging .357; with the printed decay per 1,000 steps .343).
     "standard": Preset(levels=(PyramidLevel(4_000),), start="mean", l1_decays=4),
     "preview": Preset(levels=(PyramidLevel(1_500, scale=2), PyramidLevel(400)), start="mean", l1_decays=8),
 }

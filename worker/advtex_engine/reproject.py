@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from advtex_engine.texture import bilinear_footprint
@@ -40,20 +41,20 @@ def _project(points: Tensor, relative: Tensor, intrinsics: Tensor) -> tuple[Tens
 
 
 def _visible(
-    position: Tensor, z: Tensor, maps: ViewMaps, auxiliary: Tensor, tolerance: float
+    position: Tensor, z: Tensor, depth: Tensor, size: tuple[int, int], tolerance: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The visibility test [P]; also the footprint [P,4] (flat indices, weights) that samples the auxiliary color.
+    """The visibility test [P]; also the footprint [P,4] (indices, weights) of each position.
 
-    position [P,2], z [P]; auxiliary: view index, 0-dim or [P].
+    position [P,2] pixels and z [P] metres in the view; depth [H*W] float32 metres of the view; size: width, height.
     """
+    width, height = size
     x, y = position.unbind(1)
-    inside = (z > MIN_DEPTH) & (x >= 0.5) & (x <= maps.width - 0.5) & (y >= 0.5) & (y <= maps.height - 0.5)
-    indices, weights = bilinear_footprint(torch.where(inside[:, None], position, 0.5), maps.width, maps.height)
-    indices = indices + auxiliary[..., None] * (maps.width * maps.height)
-    depth = maps.depth.view(-1).index_select(0, indices.flatten()).view(indices.shape).to(torch.float32)
-    foreground = depth > 0
+    inside = (z > MIN_DEPTH) & (x >= 0.5) & (x <= width - 0.5) & (y >= 0.5) & (y <= height - 0.5)
+    indices, weights = bilinear_footprint(position, width, height)
+    around = depth.index_select(0, indices.flatten()).view(indices.shape)
+    foreground = around > 0
     # The nearest of the four neighbors decides: a single one would fail along every slanted surface and depth edge.
-    difference = torch.where(foreground, (depth - z[:, None]).abs(), torch.inf).amin(1)
+    difference = torch.where(foreground, (around - z[:, None]).abs(), torch.inf).amin(1)
     covered = (weights * foreground).sum(1) > MIN_FOREGROUND_WEIGHT
     return inside & covered & (difference < tolerance), indices, weights
 
@@ -64,9 +65,11 @@ def seen_share(points: Tensor, relative: Tensor, maps: ViewMaps, auxiliary: Tens
     relative: [K,3,4] source camera to auxiliary cameras. auxiliary: [K] view indices. tolerance: theta_z, metres.
     """
     position, z = _project(points, relative, maps.intrinsics[auxiliary])
-    views = auxiliary[:, None].expand_as(z).flatten()
-    visible = _visible(position.flatten(0, 1), z.flatten(), maps, views, tolerance)[0]
-    return visible.view_as(z).to(torch.float32).mean(1)
+    shares = []
+    for view, (pixels, distance) in zip(auxiliary, zip(position, z, strict=True), strict=True):
+        visible, _, _ = _visible(pixels, distance, _depth_of(maps, view), (maps.width, maps.height), tolerance)
+        shares.append(visible.to(torch.float32).mean())
+    return torch.stack(shares)
 
 
 def reproject(
@@ -78,6 +81,12 @@ def reproject(
     index. tolerance: theta_z, metres. Colors are bilinear; where invisible they mean nothing.
     """
     position, z = _project(points, relative, maps.intrinsics[auxiliary])
-    visible, indices, weights = _visible(position, z, maps, auxiliary, tolerance)
-    corners = maps.color.view(-1, 3).index_select(0, indices.flatten()).view(*indices.shape, 3).to(torch.float32)
-    return (corners * weights[:, :, None]).sum(1), visible
+    depth = _depth_of(maps, auxiliary)
+    visible, indices, weights = _visible(position, z, depth, (maps.width, maps.height), tolerance)
+    image = maps.color.index_select(0, auxiliary.view(1))[0].to(torch.float32)
+    return F.embedding_bag(indices, image, per_sample_weights=weights, mode="sum"), visible
+
+
+def _depth_of(maps: ViewMaps, view: Tensor) -> Tensor:
+    """[H*W] float32 of the view with this 0-dim index."""
+    return maps.depth.index_select(0, view.view(1))[0].to(torch.float32)

@@ -42,12 +42,14 @@ def bilinear_footprint(xy: Tensor, width: int, height: int) -> tuple[Tensor, Ten
     y = (xy[:, 1] - 0.5).clamp(0, height - 1)
     x0 = x.floor().clamp(max=max(width - 2, 0))
     y0 = y.floor().clamp(max=max(height - 2, 0))
-    fx, fy = x - x0, y - y0
     corner = y0.long() * width + x0.long()
-    right = 1 if width > 1 else 0
-    down = width if height > 1 else 0
-    indices = torch.stack((corner, corner + right, corner + down, corner + down + right), dim=1)
-    weights = torch.stack(((1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy), dim=1)
+    # Both by broadcasting over a pair: stacking four arrays of pixels costs three times as much.
+    pair = torch.arange(2, device=xy.device)
+    right, down = (1 if width > 1 else 0), (width if height > 1 else 0)
+    indices = corner[:, None] + (pair[:, None] * down + pair * right).flatten()
+    across = (1 - pair - (x - x0)[:, None]).abs()
+    along = (1 - pair - (y - y0)[:, None]).abs()
+    weights = (along[:, :, None] * across[:, None, :]).flatten(1)
     return indices, weights
 
 

@@ -43,13 +43,11 @@ def bilinear_footprint(xy: Tensor, width: int, height: int) -> tuple[Tensor, Ten
     x0 = x.floor().clamp(max=max(width - 2, 0))
     y0 = y.floor().clamp(max=max(height - 2, 0))
     corner = y0.long() * width + x0.long()
-    # Both by broadcasting over a pair: stacking four arrays of pixels costs three times as much.
-    pair = torch.arange(2, device=xy.device)
     right, down = (1 if width > 1 else 0), (width if height > 1 else 0)
+    pair = torch.arange(2, device=xy.device)
     indices = corner[:, None] + (pair[:, None] * down + pair * right).flatten()
-    across = (1 - pair - (x - x0)[:, None]).abs()
-    along = (1 - pair - (y - y0)[:, None]).abs()
-    weights = (along[:, :, None] * across[:, None, :]).flatten(1)
+    fx, fy = x - x0, y - y0
+    weights = torch.stack(((1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy)).T.contiguous()
     return indices, weights
 
 

@@ -61,9 +61,7 @@ class CheckReport:
     def format_text(self) -> str:
         """The report for people, without a final line break."""
         lines = [f"layout   {self.layout} ({self.why})" if self.layout else "layout   not recognized"]
-        dropped = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in sorted(self.dropped.items()))
-        left_out = f" (left out: {dropped})" if dropped else ""
-        lines.append(f"frames   {self.frames_usable} usable of {self.frames_found}{left_out}")
+        lines.append(f"frames   {self.frames_usable} usable of {self.frames_found}{_left_out(self.dropped)}")
         lines.append(f"mesh     {self.mesh.describe()}" if self.mesh else "mesh     none")
         for finding in self.findings:
             place = f"{finding.where}: " if finding.where else ""
@@ -144,11 +142,15 @@ def _usable(reader: ScanReader, manifest: ScanManifest) -> ScanManifest:
         for name in without_depth:
             reader.findings.info("no_depth", name, "has no depth image; depth is rendered from the mesh")
     if len(frames) < MIN_FRAMES:
-        message = f"{len(frames)} frames can be used; at least {MIN_FRAMES} are needed"
-        reader.findings.error(
-            "too_few_frames", "", message, "add frames with color image and pose, or mend those above"
-        )
+        message = f"{len(frames)} frames can be used{_left_out(reader.dropped)}; at least {MIN_FRAMES} are needed"
+        remedy = "add frames with color image and pose, or mend those that are named beside this"
+        reader.findings.error("too_few_frames", "", message, remedy)
     return replace(manifest, frames=frames)
+
+
+def _left_out(dropped: Mapping[str, int]) -> str:
+    reasons = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in sorted(dropped.items()))
+    return f" (left out: {reasons})" if reasons else ""
 
 
 def _check_mesh(reader: ScanReader, manifest: ScanManifest) -> MeshFacts | None:

@@ -7,7 +7,7 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from advtex_contract.errors import ErrorCode
+from advtex_contract.errors import ErrorCode, ErrorDetail
 from advtex_server.errors import respond
 from advtex_server.refusal import ApiError
 from advtex_store.accounts import Accounts
@@ -42,10 +42,12 @@ class AccessMiddleware:
     async def _caller(self, headers: Headers) -> object:
         kind, _, key = headers.get("authorization", "").partition(" ")
         if kind.lower() != "bearer":
-            raise ApiError(ErrorCode.unauthorized, "send your key as 'Authorization: Bearer adv_…'")
+            raise _unauthorized("there is no key", "send yours as 'Authorization: Bearer adv_…'")
         caller = await run_in_threadpool(self.accounts.authenticate, key.strip())
         if caller is None:
-            raise ApiError(ErrorCode.unauthorized, "the key is unknown, revoked or expired")
+            raise _unauthorized(
+                "the key is unknown, revoked or expired", "ask for a new one; `advtex-server keys create` makes it"
+            )
         return caller
 
     def _limited(self, headers: Headers, receive: Receive) -> Receive:
@@ -65,3 +67,8 @@ class AccessMiddleware:
             return message
 
         return limited
+
+
+def _unauthorized(message: str, remedy: str) -> ApiError:
+    detail = ErrorDetail(code="bad_key", where="Authorization", message=message, remedy=remedy)
+    return ApiError(ErrorCode.unauthorized, f"{message}: {remedy}", [detail])

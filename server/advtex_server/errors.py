@@ -38,6 +38,11 @@ HTTP_CODES: Mapping[int, ErrorCode] = {
     429: ErrorCode.rate_limited,
     503: ErrorCode.unavailable,
 }
+REMEDIES = {  # by pydantic's type of error
+    "extra_forbidden": "correct the name or leave it out; /openapi.json lists what is accepted",
+    "missing": "add it; /openapi.json describes it",
+    "json_invalid": "send well-formed JSON",
+}
 RETRY_AFTER = {ErrorCode.unavailable: "5", ErrorCode.idempotency_in_flight: "1", ErrorCode.insufficient_storage: "60"}
 
 log = structlog.get_logger("advtex.server")
@@ -104,7 +109,12 @@ def install(app: FastAPI) -> None:
 
 def _validation(error: RequestValidationError) -> ApiError:
     details = [
-        ErrorDetail(code=str(e["type"]), where=".".join(str(part) for part in e["loc"]), message=str(e["msg"]))
+        ErrorDetail(
+            code=str(e["type"]),
+            where=".".join(str(part) for part in e["loc"]),
+            message=str(e["msg"]),
+            remedy=REMEDIES.get(str(e["type"]), "correct the value; /openapi.json lists what is accepted"),
+        )
         for e in error.errors()
     ]
     options = any("options" in e["loc"] for e in error.errors())

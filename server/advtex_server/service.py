@@ -216,7 +216,8 @@ class Service:
 def _rejection(details: list[ErrorDetail]) -> JobError:
     errors = [detail for detail in details if detail.severity == "error"]
     more = f" (and {len(errors) - 1} more problems)" if len(errors) > 1 else ""
-    message = f"the scan cannot be textured: {errors[0].where} {errors[0].message}{more}"
+    first = f"{errors[0].where} {errors[0].message}".lstrip()  # some are of the scan as a whole
+    message = f"the scan cannot be textured: {first}{more}"
     return JobError(code=ErrorCode.invalid_scan, message=message, details=details)
 
 

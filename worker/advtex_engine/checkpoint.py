@@ -24,17 +24,21 @@ class WorkFolder:
     """Named dictionaries of tensors and plain values below `path`, tied to `fingerprint`.
 
     save: atomic and durable, then reported to the monitor. load: None when absent, unreadable or of another run.
+    seconds: spent in `save` so far.
     """
 
     def __init__(self, path: Path, fingerprint: str, monitor: Monitor) -> None:
         self.path, self.fingerprint, self.monitor = path, fingerprint, monitor
+        self.seconds = 0.0
         path.mkdir(parents=True, exist_ok=True)
 
     def save(self, name: str, content: Mapping[str, Any]) -> None:
+        started = time.monotonic()
         target = self.path / f"{name}.pt"
         with atomic_file(target) as file:
             torch.save({"fingerprint": self.fingerprint, **content}, file)
         self.monitor.checkpointed((target,))
+        self.seconds += time.monotonic() - started
 
     def load(self, name: str) -> dict[str, Any] | None:
         target = self.path / f"{name}.pt"
@@ -57,7 +61,6 @@ class CheckpointTimer:
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
-        self.spent = 0.0
         self._due = time.monotonic() + seconds
 
     def due(self) -> bool:
@@ -66,5 +69,4 @@ class CheckpointTimer:
     def wrote(self, started: float) -> None:
         """Call after a write that began at `started` (time.monotonic)."""
         now = time.monotonic()
-        self.spent += now - started
         self._due = now + max(self.seconds, (now - started) / MAX_SHARE)

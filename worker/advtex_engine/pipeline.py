@@ -89,6 +89,7 @@ def texture_scan(
         "atlas": {key: getattr(atlas, key) for key in ("width", "height", "source", "charts")},
         "touched_texels": maps[1].slots,
         "stages": stages.records,
+        "saving_seconds": round(folder.seconds, 3),
         "losses": losses,
         "heldout": scores,
     }

@@ -12,6 +12,12 @@ depends_on = None
 
 
 def upgrade() -> None:
+    _create_keys_and_uploads()
+    _create_jobs()
+    _create_what_belongs_to_jobs()
+
+
+def _create_keys_and_uploads() -> None:
     op.create_table(
         "api_keys",
         sa.Column("id", sa.String(length=255), nullable=False),
@@ -41,6 +47,9 @@ def upgrade() -> None:
     )
     op.create_index(op.f("ix_uploads_expires_at"), "uploads", ["expires_at"], unique=False)
     op.create_index(op.f("ix_uploads_owner"), "uploads", ["owner"], unique=False)
+
+
+def _create_jobs() -> None:
     op.create_table(
         "jobs",
         sa.Column("id", sa.String(length=255), nullable=False),
@@ -77,6 +86,9 @@ def upgrade() -> None:
     op.create_index("ix_jobs_owner_id", "jobs", ["owner", "id"], unique=False)
     op.create_index("ix_jobs_state_id", "jobs", ["state", "id"], unique=False)
     op.create_index(op.f("ix_jobs_upload_id"), "jobs", ["upload_id"], unique=False)
+
+
+def _create_what_belongs_to_jobs() -> None:
     op.create_table(
         "events",
         sa.Column("job_id", sa.String(length=255), nullable=False),

@@ -16,7 +16,7 @@ from advtex_engine.planar import planar_views
 from advtex_engine.texture import bilinear_footprint, decode_uv
 
 WIDTH, HEIGHT = 96, 72
-PRESET = dataclasses.replace(PRESETS["standard"], l1_decays=4)
+PRESET = dataclasses.replace(PRESETS["full"], l1_decays=4)
 
 
 def optimizer(seed: int = 0, steps: int = 20) -> AdversarialOptimizer:
@@ -129,6 +129,22 @@ def test_lambda_falls_in_equal_periods_over_the_run() -> None:
         of.index = index
         weights.append(of.l1_weight)
     assert weights == pytest.approx([10 * 0.8 ** (index // 5) for index in range(20)])
+
+
+def test_the_learning_rate_falls_in_a_straight_line_and_the_texture_follows_it() -> None:
+    of = optimizer(steps=20)
+    of.preset = dataclasses.replace(PRESET, lr_texture_end=0.1)
+    rates = []
+    for index in (0, 10, 20):
+        of.index = index
+        rates.append(of.lr_texture)
+    assert rates == pytest.approx([1e-3, 0.55e-3, 0.1e-3])
+    # Adam's first step is the learning rate itself, wherever there is a gradient.
+    before = of.values.detach().clone()
+    of.index = 10
+    of.step()
+    moved = (of.values.detach() - before).abs()
+    assert moved.max().item() == pytest.approx(0.55e-3, rel=0.02)
 
 
 def test_losses_are_means_since_the_last_call() -> None:

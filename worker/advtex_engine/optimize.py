@@ -112,6 +112,12 @@ class AdversarialOptimizer:
         periods = int(self.index * self.preset.l1_decays / self.steps)
         return self.preset.l1_weight * self.preset.l1_decay**periods
 
+    @property
+    def lr_texture(self) -> float:
+        """The texture's learning rate at this step: from lr_texture in a straight line to lr_texture_end of it."""
+        done = self.index / self.steps
+        return self.preset.lr_texture * (1 - (1 - self.preset.lr_texture_end) * done)
+
     def draw(self) -> Batch:
         """A random pair and crop, with the auxiliary view warped into the source."""
         maps, device = self.maps, self.device
@@ -173,6 +179,7 @@ class AdversarialOptimizer:
     def update_texture(self, gradient: Tensor) -> None:
         """One step of Adam over the compact texture."""
         self.values.grad = gradient
+        self.adam_texture.param_groups[0]["lr"] = self.lr_texture
         self.adam_texture.step()
 
     def update_discriminator(self, losses: Losses) -> None:

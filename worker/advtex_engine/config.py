@@ -60,7 +60,7 @@ PRESETS: dict[str, Preset] = {
     # In so few steps the discriminator learns little: with lambda falling to nothing, flat walls turn noisy (a kitchen
     # at 320x240: LPIPS of held-out views .382, averaging .357; with the printed decay per 1,000 steps .343). A texture
     # that slows down lets the discriminator get ahead and sheds its speckles (a second kitchen, averaging .393: .401
-    # after 4,000 steps at one rate, .374 after 1,600 at a falling one).
+    # at one rate, .382 at a falling one).
     "standard": Preset(levels=(PyramidLevel(4_000),), start="mean", l1_decays=4, lr_texture_end=0.1),
     "preview": Preset(levels=(PyramidLevel(1_500, scale=2), PyramidLevel(400)), start="mean", l1_decays=8),
 }

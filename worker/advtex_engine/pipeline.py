@@ -73,7 +73,7 @@ def texture_scan(
     with stages.run("initial_texture"):
         averages = {scale: average_texture(level) for scale, level in maps.items()}
     with stages.run("optimization"):
-        given = MethodInput(maps, averages, scene.kind, preset, config, monitor, folder)
+        given = MethodInput(scene, atlas, maps, averages, preset, config, monitor, folder)
         texture, losses = METHODS[config.method](given)
     with stages.run("dilation"):
         texture = fill_holes(texture, maps[1].slot_map >= 0).cpu()

@@ -50,10 +50,10 @@ def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
         maps = given.maps[level.scale]
         optimizer = AdversarialOptimizer(
             maps,
-            related_pairs(maps, given.kind, preset.max_pair_angle, preset.min_pair_overlap),
+            related_pairs(maps, given.scene.kind, preset.max_pair_angle, preset.min_pair_overlap),
             _compact(maps, texture),
             preset,
-            kind=given.kind,
+            kind=given.scene.kind,
             steps=preset.steps,
             generator=generator,
             discriminator=discriminator,

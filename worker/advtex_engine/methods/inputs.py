@@ -11,6 +11,7 @@ from torch import Tensor
 from advtex_engine.checkpoint import WorkFolder
 from advtex_engine.config import Preset, TextureConfig
 from advtex_engine.monitor import Monitor
+from advtex_engine.scene import Atlas, Scene
 from advtex_engine.views import ViewMaps
 
 LossPoint = dict[str, Any]
@@ -18,14 +19,16 @@ LossPoint = dict[str, Any]
 
 @dataclass(frozen=True)
 class MethodInput:
-    """View maps and averaged textures per pyramid scale (1 = full working size), and how to run.
+    """The scene, its atlas, view maps and averaged textures per pyramid scale (1 = full working size), and how to run.
 
+    atlas.mesh is on the device that the run uses; scene's views stay on the CPU.
     averages: dense textures [H,W,3] float32 in [0,1], defined on every texel.
     """
 
+    scene: Scene
+    atlas: Atlas
     maps: Mapping[int, ViewMaps]
     averages: Mapping[int, Tensor]
-    kind: str
     preset: Preset
     config: TextureConfig
     monitor: Monitor

@@ -85,7 +85,7 @@ def test_a_run_leaves_models_previews_and_a_report(whole: tuple[Path, Recorder])
     assert report["scan"]["heldout"] == sorted(report["scan"]["heldout"])
     assert len(report["scan"]["heldout"]) == 2
     assert report["scan"]["views"] == 10
-    assert set(report["heldout"]) == {"texture", "average"}
+    assert set(report["heldout"]) == {"texture", "mean"}
     assert report["options"]["steps"] == STEPS
     assert report["versions"]["torch"].startswith("2.")
 
@@ -212,8 +212,8 @@ def test_a_pyramid_that_is_stopped_at_either_level_resumes_to_the_same_bytes(
     assert (tmp_path / "whole" / "model.png").read_bytes() == (tmp_path / "two" / "model.png").read_bytes()
 
 
-def test_the_average_method_takes_no_steps(scan: Path, tmp_path: Path) -> None:
-    config = TextureConfig(method="average", face_budget=4000, device="cpu")
+def test_the_mean_method_takes_no_steps(scan: Path, tmp_path: Path) -> None:
+    config = TextureConfig(method="mean", face_budget=4000, device="cpu")
     result = texture_scan(scan, tmp_path, config, work=tmp_path / "work", monitor=Recorder())
     assert result.report["losses"] == []
     assert (tmp_path / "model.glb").exists()

@@ -89,8 +89,8 @@ def test_a_camera_that_looks_away_sees_the_background() -> None:
 
 
 def test_side_by_side_holds_the_three_pictures(tmp_path: Path) -> None:
-    rendered, averaged = torch.full((HEIGHT, WIDTH, 3), 0.6), torch.full((HEIGHT, WIDTH, 3), 1.7)
-    side_by_side(view(), rendered, averaged, tmp_path / "comparison.png")
+    rendered, mean = torch.full((HEIGHT, WIDTH, 3), 0.6), torch.full((HEIGHT, WIDTH, 3), 1.7)
+    side_by_side(view(), rendered, mean, tmp_path / "comparison.png")
     image = read(tmp_path / "comparison.png")
     assert image.shape == (HEIGHT + CAPTION_HEIGHT, 3 * WIDTH + 2 * GUTTER, 3)
     panels = [image[CAPTION_HEIGHT:, i * (WIDTH + GUTTER) :][:, :WIDTH] for i in range(3)]

@@ -25,7 +25,7 @@ class Preset:
     """Hyper-parameters of the optimization (paper sections 3.2 and 4; supplement "Training").
 
     levels            coarse-to-fine schedule; one level for everything but `preview`
-    start             "zero" (paper) or "mean" (texture starts as the projected average)
+    start             "zero" (paper) or "mean" (texture starts as the projected mean)
     lr_texture        1e-3, Adam; colors in [0, 1]
     lr_texture_end    share of lr_texture at the last step, reached in a straight line (paper: 1, no decay)
     lr_discriminator  1e-4, Adam
@@ -64,7 +64,7 @@ PRESETS: dict[str, Preset] = {
     "standard": Preset(levels=(PyramidLevel(4_000),), start="mean", l1_decays=4, lr_texture_end=0.1),
     "preview": Preset(levels=(PyramidLevel(1_500, scale=2), PyramidLevel(400)), start="mean", l1_decays=8),
 }
-METHODS = ("adversarial", "average")
+METHODS = ("adversarial", "mean")
 
 
 @dataclass(frozen=True)

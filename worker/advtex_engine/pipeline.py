@@ -24,7 +24,7 @@ from advtex_engine.export import export_model
 from advtex_engine.geometry import clean, decimate
 from advtex_engine.ingest import ingest
 from advtex_engine.methods import METHODS, MethodInput
-from advtex_engine.methods.average import average_texture
+from advtex_engine.methods.mean import mean_texture
 from advtex_engine.monitor import Monitor
 from advtex_engine.report import (
     Stages,
@@ -71,19 +71,19 @@ def texture_scan(
     atlas = replace(atlas, mesh=_mesh_to(atlas.mesh, device))
     maps = _view_maps(scene, atlas, preset, folder, stages, device)
     with stages.run("initial_texture"):
-        averages = {scale: average_texture(level) for scale, level in maps.items()}
+        means = {scale: mean_texture(level) for scale, level in maps.items()}
     with stages.run("optimization"):
-        given = MethodInput(scene, atlas, maps, averages, preset, config, monitor, folder)
+        given = MethodInput(scene, atlas, maps, means, preset, config, monitor, folder)
         texture, losses = METHODS[config.method](given)
     with stages.run("dilation"):
         texture = fill_holes(texture, maps[1].slot_map >= 0).cpu()
-        average = averages[1].cpu()
+        mean = means[1].cpu()
     atlas = replace(atlas, mesh=_mesh_to(atlas.mesh, torch.device("cpu")))
     with stages.run("export"):
         files = export_model(out, atlas, texture, up_axis=scene.up_axis)
     with stages.run("previews"):
-        files += write_previews(out, scene, atlas, texture, average)
-        scores = heldout_scores(scene, atlas, texture, average)
+        files += write_previews(out, scene, atlas, texture, mean)
+        scores = heldout_scores(scene, atlas, texture, mean)
     parts = {
         "scan": describe_scene(scene),
         "atlas": {key: getattr(atlas, key) for key in ("width", "height", "source", "charts")},
@@ -171,7 +171,7 @@ def _prepare(
 def _view_maps(
     scene: Scene, atlas: Atlas, preset: Preset, folder: WorkFolder, stages: Stages, device: torch.device
 ) -> dict[int, ViewMaps]:
-    """View maps for every scale of the preset, and for the full size, which averages and export need."""
+    """View maps for every scale of the preset, and for the full size, which mean textures and export need."""
     maps: dict[int, ViewMaps] = {}
     with stages.run("view_maps"):
         for scale in sorted({1, *(level.scale for level in preset.levels)}):

@@ -56,10 +56,10 @@ def render_layers(atlas: Atlas, texture: Tensor, camera: Camera, *, supersample:
     return blocks[..., :3], blocks[..., 3]
 
 
-def side_by_side(view: View, rendered: Tensor, averaged: Tensor, path: Path) -> None:
-    """Write a PNG: photograph | textured render | plain averaging, each [H,W,3] float sRGB in [0,1]."""
+def side_by_side(view: View, rendered: Tensor, mean: Tensor, path: Path) -> None:
+    """Write a PNG: photograph | textured render | projected mean, each [H,W,3] float sRGB in [0,1]."""
     photo = view.color.to(torch.float32) / 255
-    _write_png(path, _row((photo, rendered, averaged), ("photograph", "advtex", "plain average"), view.name))
+    _write_png(path, _row((photo, rendered, mean), ("photograph", "advtex", "projected mean"), view.name))
 
 
 def contact_sheet(views: Sequence[View], rows: Sequence[Sequence[Tensor]], captions: Sequence[str], path: Path) -> None:

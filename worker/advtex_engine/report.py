@@ -130,8 +130,8 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
     }
 
 
-def heldout_scores(scene: Scene, atlas: Atlas, texture: Tensor, average: Tensor) -> dict[str, Any] | None:
-    """Scores of the held-out views for the texture and for plain averaging; None when no view was held out.
+def heldout_scores(scene: Scene, atlas: Atlas, texture: Tensor, mean: Tensor) -> dict[str, Any] | None:
+    """Scores of the held-out views for the texture and for the projected mean; None when no view was held out.
 
     A pixel counts where the mesh is hit and the device's depth, where there is one, agrees with it.
     """
@@ -147,25 +147,25 @@ def heldout_scores(scene: Scene, atlas: Atlas, texture: Tensor, average: Tensor)
         photos.append(view.color.to(torch.float32) / 255)
         masks.append(mask)
     scores = {}
-    for name, candidate in (("texture", texture), ("average", average)):
+    for name, candidate in (("texture", texture), ("mean", mean)):
         renders = [render_layers(atlas, candidate, view.camera)[0] for view in scene.heldout]
         scores[name] = score_views(renders, photos, masks)
     return scores
 
 
-def write_previews(out: Path, scene: Scene, atlas: Atlas, texture: Tensor, average: Tensor) -> tuple[Path, ...]:
-    """previews/comparison.png (one view) and previews/sheet.png: photograph | texture | plain average.
+def write_previews(out: Path, scene: Scene, atlas: Atlas, texture: Tensor, mean: Tensor) -> tuple[Path, ...]:
+    """previews/comparison.png (one view) and previews/sheet.png: photograph | texture | projected mean.
 
     Held-out views where there are some, else training views from all over the capture.
     """
     folder = out / "previews"
     folder.mkdir(exist_ok=True)
     views = evenly_spread(scene.heldout or scene.views, SHEET_VIEWS)
-    rows = [[render_view(atlas, candidate, view.camera) for candidate in (texture, average)] for view in views]
+    rows = [[render_view(atlas, candidate, view.camera) for candidate in (texture, mean)] for view in views]
     comparison, sheet = folder / "comparison.png", folder / "sheet.png"
     middle = len(views) // 2
     side_by_side(views[middle], rows[middle][0], rows[middle][1], comparison)
-    contact_sheet(views, rows, ("advtex", "plain average"), sheet)
+    contact_sheet(views, rows, ("advtex", "projected mean"), sheet)
     return comparison, sheet
 
 

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from torch import Tensor
 
 from advtex_engine.methods.adversarial import adversarial
-from advtex_engine.methods.average import average
 from advtex_engine.methods.inputs import LossPoint, MethodInput
+from advtex_engine.methods.mean import mean
 
 Method = Callable[[MethodInput], tuple[Tensor, list[LossPoint]]]
 
-METHODS: dict[str, Method] = {"adversarial": adversarial, "average": average}
+METHODS: dict[str, Method] = {"adversarial": adversarial, "mean": mean}
 
 __all__ = ["METHODS", "LossPoint", "Method", "MethodInput"]

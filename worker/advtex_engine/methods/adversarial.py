@@ -12,8 +12,8 @@ from torch import Tensor
 from advtex_engine.checkpoint import CHECKPOINT, CheckpointTimer
 from advtex_engine.discriminator import PatchDiscriminator
 from advtex_engine.errors import Stopped
-from advtex_engine.methods.average import dense_texture
 from advtex_engine.methods.inputs import LossPoint, MethodInput
+from advtex_engine.methods.mean import dense_texture
 from advtex_engine.optimize import AdversarialOptimizer
 from advtex_engine.views import ViewMaps, related_pairs
 
@@ -94,7 +94,7 @@ def _run_level(
 
 def _start(given: MethodInput) -> Tensor:
     """The first level's dense start in [0,1]."""
-    first = given.averages[given.preset.levels[0].scale]
+    first = given.means[given.preset.levels[0].scale]
     return torch.zeros_like(first) if given.preset.start == "zero" else first
 
 

@@ -19,16 +19,16 @@ LossPoint = dict[str, Any]
 
 @dataclass(frozen=True)
 class MethodInput:
-    """The scene, its atlas, view maps and averaged textures per pyramid scale (1 = full working size), and how to run.
+    """The scene, its atlas, view maps and mean textures per pyramid scale (1 = full working size), and how to run.
 
     atlas.mesh is on the device that the run uses; scene's views stay on the CPU.
-    averages: dense textures [H,W,3] float32 in [0,1], defined on every texel.
+    means: dense textures [H,W,3] float32 in [0,1], defined on every texel.
     """
 
     scene: Scene
     atlas: Atlas
     maps: Mapping[int, ViewMaps]
-    averages: Mapping[int, Tensor]
+    means: Mapping[int, Tensor]
     preset: Preset
     config: TextureConfig
     monitor: Monitor

@@ -10,12 +10,12 @@ from advtex_engine.texture import bilinear_footprint, decode_uv, fill_holes
 from advtex_engine.views import ViewMaps
 
 
-def average(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
-    """The averaged texture at full size, [H,W,3] float32 in [0,1]; no iterations, so no losses."""
-    return given.averages[1], []
+def mean(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
+    """The mean texture at full size, [H,W,3] float32 in [0,1]; no iterations, so no losses."""
+    return given.means[1], []
 
 
-def average_texture(maps: ViewMaps) -> Tensor:
+def mean_texture(maps: ViewMaps) -> Tensor:
     """Splats all foreground pixels with their bilinear weights, normalizes, fills the rest -> [H,W,3] in [0,1]."""
     height, width = maps.slot_map.shape
     device = maps.color.device

@@ -34,6 +34,8 @@ class Preset:
     l1_decay          lambda is multiplied by this `l1_decays` times over the run (paper: 0.8 every 1,000 of 50,000)
     max_pair_angle    largest angle between the optical axes of a pair, degrees (released code: 15)
     min_pair_overlap  least share of the source's foreground that the auxiliary view sees
+    auxiliary         real examples are warped auxiliary views; else the source itself (ablation, paper section 4)
+    condition         the discriminator is shown the source image; else the example alone (ablation, paper section 4)
     """
 
     levels: tuple[PyramidLevel, ...]
@@ -47,6 +49,8 @@ class Preset:
     l1_decays: float = 50.0
     max_pair_angle: float = 15.0
     min_pair_overlap: float = 0.3
+    auxiliary: bool = True
+    condition: bool = True
 
     @property
     def steps(self) -> int:
@@ -64,7 +68,12 @@ PRESETS: dict[str, Preset] = {
     "standard": Preset(levels=(PyramidLevel(4_000),), start="mean", l1_decays=4, lr_texture_end=0.1),
     "preview": Preset(levels=(PyramidLevel(1_500, scale=2), PyramidLevel(400)), start="mean", l1_decays=8),
 }
-METHODS = ("adversarial", "mean")
+METHODS = (
+    "adversarial",
+    "adversarial_no_auxiliary",
+    "adversarial_no_condition",
+    "mean",
+)
 
 
 @dataclass(frozen=True)

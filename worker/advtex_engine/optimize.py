@@ -162,9 +162,11 @@ class AdversarialOptimizer:
         """Renders the fake example and lets the discriminator judge both; one fake forward pass serves both players."""
         masks = patch_masks(batch.foreground, batch.visible)
         fake = self._image(sample_texels(self.values, batch.slots, batch.weights)) * 2 - 1
+        # Without the condition the network sees the example itself beside three empty channels.
+        condition = batch.condition if self.preset.condition else torch.zeros_like(batch.condition)
         with self._autocast():
-            fake_logits = self.discriminator(batch.condition, (fake - batch.condition) * batch.visible).float()
-            real_logits = self.discriminator(batch.condition, (batch.real - batch.condition) * batch.visible).float()
+            fake_logits = self.discriminator(condition, (fake - condition) * batch.visible).float()
+            real_logits = self.discriminator(condition, (batch.real - condition) * batch.visible).float()
         of_discriminator = discriminator_loss(real_logits, fake_logits, masks.discriminator)
         adversarial = adversarial_loss(fake_logits, masks.texture)
         ahead = (of_discriminator <= adversarial).to(torch.float32).detach()

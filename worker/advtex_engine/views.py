@@ -137,6 +137,14 @@ def overlaps(maps: ViewMaps, kind: str, max_angle: float, sources: Iterable[int]
     return share
 
 
+def own_pairs(maps: ViewMaps) -> Pairs:
+    """Every view with itself alone: the ablation without auxiliary views (paper section 4)."""
+    views = torch.arange(maps.count, device=maps.depth.device)
+    has_foreground = (maps.depth > 0).any(1)
+    relative = torch.eye(4, device=maps.depth.device)[:3].repeat(maps.count, 1, 1, 1)
+    return Pairs(views[:, None], has_foreground.long(), has_foreground.nonzero().flatten(), relative)
+
+
 def related_pairs(maps: ViewMaps, kind: str, max_angle: float, min_overlap: float) -> Pairs:
     """Auxiliary candidates per source: optical axes within max_angle (degrees) and overlap above min_overlap.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -15,7 +15,7 @@ from advtex_engine.errors import Stopped
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.methods.mean import dense_texture
 from advtex_engine.optimize import AdversarialOptimizer
-from advtex_engine.views import ViewMaps, related_pairs
+from advtex_engine.views import Pairs, ViewMaps, own_pairs, related_pairs
 
 HISTORY_POINTS = 200  # loss means kept for the report and shown as progress
 
@@ -50,7 +50,7 @@ def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
         maps = given.maps[level.scale]
         optimizer = AdversarialOptimizer(
             maps,
-            related_pairs(maps, given.scene.kind, preset.max_pair_angle, preset.min_pair_overlap),
+            _pairs(given, maps),
             _compact(maps, texture),
             preset,
             kind=given.scene.kind,
@@ -66,6 +66,22 @@ def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
         texture = dense_texture(maps, optimizer.values.detach())
         run.level = number + 1
     return texture.clamp(0, 1), run.losses
+
+
+def adversarial_no_auxiliary(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
+    """Ablation: the real example is the source image itself, so nothing teaches the misalignments."""
+    return adversarial(replace(given, preset=replace(given.preset, auxiliary=False)))
+
+
+def adversarial_no_condition(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
+    """Ablation: the discriminator sees the example without the source image, so it cannot tell what belongs where."""
+    return adversarial(replace(given, preset=replace(given.preset, condition=False)))
+
+
+def _pairs(given: MethodInput, maps: ViewMaps) -> Pairs:
+    if not given.preset.auxiliary:
+        return own_pairs(maps)
+    return related_pairs(maps, given.scene.kind, given.preset.max_pair_angle, given.preset.min_pair_overlap)
 
 
 def _run_level(

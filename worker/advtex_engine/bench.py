@@ -15,9 +15,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from advtex_engine.batches import Batch
 from advtex_engine.config import PRESETS
 from advtex_engine.discriminator import PatchDiscriminator
-from advtex_engine.optimize import AdversarialOptimizer, Batch, Losses, crop_size
+from advtex_engine.optimize import AdversarialOptimizer, Losses, crop_size
 from advtex_engine.planar import planar_views
 from advtex_engine.views import Pairs, ViewMaps
 

@@ -5,9 +5,9 @@ discriminator judge [I_A, real - I_A] and [I_A, fake - I_A]; update both players
 
 The texture's values are in [0, 1], so that its learning rate is in those units; the networks see colors in [-1, 1].
 Pixels that B does not see carry a zero residual in the real and in the fake example alike, so
-that the discriminator cannot tell them apart by their holes. All draws come from one generator on the device, and
-nothing in `step` waits for the device: the crop's size is fixed and only its offset is drawn, a skipped discriminator
-update is a flag that Adam's kernel reads. On a CPU, where a branch costs nothing, the skipped gradient is not computed.
+that the discriminator cannot tell them apart by their holes. Nothing in `step` waits for the device: a skipped
+discriminator update is a flag that Adam's kernel reads. On a CPU, where a branch costs nothing, the skipped gradient is
+not computed.
 """
 
 from __future__ import annotations
@@ -19,27 +19,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from advtex_engine.batches import Batch, PairSampler
 from advtex_engine.config import Preset
 from advtex_engine.discriminator import MIN_SIZE, PatchDiscriminator
 from advtex_engine.losses import adversarial_loss, discriminator_loss, l1_loss, patch_masks
-from advtex_engine.reproject import reproject, unproject_pixels
-from advtex_engine.texture import bilinear_footprint, decode_uv, sample_texels
-from advtex_engine.views import DEPTH_TOLERANCE, Pairs, ViewMaps
+from advtex_engine.texture import sample_texels
+from advtex_engine.views import Pairs, ViewMaps
 
 CROP_SHARE = 0.1  # the released code shifts its crop by up to 69 of 640 pixels, about a tenth of the width
 LOSS_NAMES = ("discriminator", "adversarial", "l1", "skipped")
-
-
-@dataclass(frozen=True)
-class Batch:
-    """One pair, cropped to h x w: images [1,3,h,w] in [-1,1], masks [1,1,h,w] float 0/1, footprints [h*w,4]."""
-
-    condition: Tensor
-    real: Tensor
-    foreground: Tensor
-    visible: Tensor
-    slots: Tensor
-    weights: Tensor
 
 
 @dataclass(frozen=True)
@@ -89,7 +77,6 @@ class AdversarialOptimizer:
         device = maps.color.device
         self.maps, self.pairs, self.preset, self.device = maps, pairs, preset, device
         self.steps, self.index = steps, 0
-        self.tolerance = DEPTH_TOLERANCE[kind]
         self.generator = generator
         self.values = values.clone().to(device).requires_grad_(True)
         self.discriminator = discriminator
@@ -98,11 +85,7 @@ class AdversarialOptimizer:
         self.adam_discriminator = _adam(self.parameters, preset.lr_discriminator, preset.beta1)
         self.bfloat16 = native_bfloat16(device)
         self.crop = crop_size(maps.width, maps.height)
-        rows, columns = torch.arange(self.crop[1], device=device), torch.arange(self.crop[0], device=device)
-        self._window = (rows[:, None] * maps.width + columns).flatten()
-        self._window_xy = torch.stack((columns.repeat(len(rows)), rows.repeat_interleave(len(columns))), 1) + 0.5
-        self._texture_size = torch.tensor(maps.slot_map.shape[::-1], dtype=torch.float32, device=device)
-        self._slot_map = maps.slot_map.flatten()
+        self.sampler = PairSampler(maps, pairs, kind, self.crop, generator)
         self._sums = torch.zeros(len(LOSS_NAMES), device=device)
         self._summed = 0
 
@@ -120,33 +103,7 @@ class AdversarialOptimizer:
 
     def draw(self) -> Batch:
         """A random pair and crop, with the auxiliary view warped into the source."""
-        maps, device = self.maps, self.device
-        random = torch.rand(4, generator=self.generator, device=device)
-        source = self.pairs.sources[_pick(random[0], self.pairs.sources.shape[0])]
-        candidate = _pick(random[1], self.pairs.count[source])
-        auxiliary = self.pairs.auxiliary[source, candidate]
-        width, height = self.crop
-        left = _pick(random[2], maps.width - width + 1)
-        top = _pick(random[3], maps.height - height + 1)
-        pixels = self._window + (top * maps.width + left)
-        flat = pixels + source * (maps.width * maps.height)
-        depth = maps.depth.view(-1).index_select(0, flat).to(torch.float32)
-        foreground = depth > 0
-        points = unproject_pixels(self._window_xy + torch.stack((left, top)), depth, maps.intrinsics[source])
-        real, visible = reproject(points, self.pairs.relative[source, candidate], maps, auxiliary, self.tolerance)
-        visible = visible & foreground
-        uv = decode_uv(maps.uv.view(-1, 2).index_select(0, flat))
-        texels, weights = bilinear_footprint(uv * self._texture_size, maps.slot_map.shape[1], maps.slot_map.shape[0])
-        # A background pixel has uv 0; its weight is 0, so any row may stand for the texel that nobody owns.
-        slots = self._slot_map.index_select(0, texels.flatten()).view(texels.shape).clamp(min=0)
-        return Batch(
-            condition=self._image(maps.color.view(-1, 3).index_select(0, flat).to(torch.float32) / 127.5 - 1),
-            real=self._image(real / 127.5 - 1),
-            foreground=self._image(foreground.to(torch.float32)[:, None]),
-            visible=self._image(visible.to(torch.float32)[:, None]),
-            slots=slots,
-            weights=weights * visible[:, None],
-        )
+        return self.sampler.draw()
 
     def step(self) -> None:
         """Draws a pair, updates the texture, and the discriminator unless it is ahead (its loss <= the texture's)."""
@@ -161,7 +118,7 @@ class AdversarialOptimizer:
     def play(self, batch: Batch) -> Losses:
         """Renders the fake example and lets the discriminator judge both; one fake forward pass serves both players."""
         masks = patch_masks(batch.foreground, batch.visible)
-        fake = self._image(sample_texels(self.values, batch.slots, batch.weights)) * 2 - 1
+        fake = self.sampler.image(sample_texels(self.values, batch.slots, batch.weights)) * 2 - 1
         # Without the condition the network sees the example itself beside three empty channels.
         condition = batch.condition if self.preset.condition else torch.zeros_like(batch.condition)
         with self._autocast():
@@ -228,10 +185,6 @@ class AdversarialOptimizer:
         self.adam_discriminator.load_state_dict(state["adam_discriminator"])
         self.generator.set_state(state["generator"])
 
-    def _image(self, rows: Tensor) -> Tensor:
-        """Rows [h*w,C] as an image [1,C,h,w] (channels_last memory, no copy)."""
-        return rows.view(1, self.crop[1], self.crop[0], rows.shape[1]).permute(0, 3, 1, 2)
-
     def _autocast(self) -> contextlib.AbstractContextManager[Any]:
         if not self.bfloat16:
             return contextlib.nullcontext()
@@ -241,8 +194,3 @@ class AdversarialOptimizer:
 def _adam(parameters: list[Any], lr: float, beta1: float) -> torch.optim.Adam:
     on_gpu = parameters[0].device.type == "cuda"
     return torch.optim.Adam(parameters, lr=lr, betas=(beta1, 0.999), fused=True, capturable=on_gpu)
-
-
-def _pick(random: Tensor, count: int | Tensor) -> Tensor:
-    """Uniform integer in [0, count) from a uniform number in [0, 1); float32 rounding must not reach count."""
-    return (random * count).long().clamp(max=count - 1)

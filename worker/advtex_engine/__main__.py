@@ -1,4 +1,4 @@
-"""`advtex-engine texture|synthesize|compare|bench`: the engine alone, without a service."""
+"""`advtex-engine texture|evaluate|synthesize|compare|bench`: the engine alone, without a service."""
 
 from __future__ import annotations
 
@@ -79,6 +79,15 @@ def _parser() -> argparse.ArgumentParser:
     texture.add_argument("--seed", type=int, default=0)
     texture.add_argument("--checkpoint-seconds", type=float, default=TextureConfig.checkpoint_seconds)
     texture.add_argument("--resume", action="store_true", help="go on from the checkpoint in OUT/work")
+    evaluate = commands.add_parser("evaluate", help="score a textured model against a scan's photographs")
+    evaluate.add_argument("model", type=Path, help="OBJ or GLB with one texture")
+    evaluate.add_argument("scan", type=Path, help="folder or zip")
+    evaluate.add_argument("--holdout", type=int, help="only the sorted frames whose position %% N == N // 2")
+    evaluate.add_argument("--size", type=parse_size, help="size of renders and photographs, WIDTHxHEIGHT")
+    evaluate.add_argument("--lpips-weights", type=Path, help="folder; default: $ADVTEX_LPIPS_WEIGHTS, else the cache")
+    evaluate.add_argument("--download-weights", action="store_true", help="fetch the weights of LPIPS if they lack")
+    evaluate.add_argument("--json", type=Path, help="write the scores per view and their means")
+    evaluate.add_argument("--contact-sheet", type=Path, help="write a PNG: photograph, render, difference")
     synthesize = commands.add_parser("synthesize", help="make a scan with known truth")
     synthesize.add_argument("out", type=Path, help="folder, or file.zip")
     synthesize.add_argument("--views", type=int, default=60)
@@ -123,6 +132,23 @@ def _texture(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _evaluate(arguments: argparse.Namespace) -> int:
+    from advtex_engine.evaluate import evaluate, write_json
+    from advtex_engine.perceptual import LPIPS_SOURCES, download, weights_folder
+
+    if arguments.download_weights:
+        download(LPIPS_SOURCES, weights_folder(arguments.lpips_weights))
+    given = {name: getattr(arguments, name) for name in ("model", "scan", "size", "holdout")}
+    evaluation = evaluate(**given, weights=arguments.lpips_weights, sheet=arguments.contact_sheet, monitor=_Terminal())
+    if arguments.json is not None:
+        write_json(arguments.json, evaluation, given)
+    for name, value in evaluation.mean.items():
+        print(f"{name:24}{'-' if value is None else format(value, '.4g')}")
+    for name, reason in evaluation.missing.items():
+        print(f"{name} is missing: {reason}", file=sys.stderr)
+    return 0
+
+
 def _synthesize(arguments: argparse.Namespace) -> int:
     from advtex_engine.synthesize import synthesize
 
@@ -150,7 +176,13 @@ def _bench(arguments: argparse.Namespace) -> int:
     return 0
 
 
-_COMMANDS = {"texture": _texture, "synthesize": _synthesize, "compare": _compare, "bench": _bench}
+_COMMANDS = {
+    "texture": _texture,
+    "evaluate": _evaluate,
+    "synthesize": _synthesize,
+    "compare": _compare,
+    "bench": _bench,
+}
 
 
 if __name__ == "__main__":

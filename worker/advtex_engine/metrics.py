@@ -1,4 +1,4 @@
-"""How a render differs from a photograph, and a texture from the truth.
+"""How a render differs from a photograph, and a texture from the truth; `sharpness.py` has the spectral measures.
 
 Images are [H,W,3] float sRGB in [0,1]; masks are [H,W] bool and say which pixels count. Nothing here is used in the
 optimization. PSNR and SSIM assume perfect alignment and prefer a blurred image to a sharp one that is a pixel off: on
@@ -21,6 +21,10 @@ PATCH = 7
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 PROJECTIONS = 256
+MAX_PATCHES = 1 << 16
+"""Patches per image in the sliced Wasserstein distance; of more, as many are drawn, at the same places in both."""
+GRADIENT_MARGIN = 2
+"""Pixels between the mask's edge and those whose gradient counts: the edge itself is a step that belongs to neither."""
 MAX_PSNR = 100.0
 """Decibels given to equal images."""
 CHUNK_BYTES = 256 << 20
@@ -40,7 +44,7 @@ def ssim(image: Tensor, truth: Tensor, mask: Tensor) -> float:
     The window's weights are those of the masked pixels alone, so nothing outside the mask has any influence.
     """
     _check(image, truth, mask)
-    x, y, weight = _luminance(image), _luminance(truth), mask.to(torch.float32)
+    x, y, weight = luminance(image), luminance(truth), mask.to(torch.float32)
     offset = torch.arange(SSIM_WINDOW, dtype=torch.float32, device=image.device) - SSIM_WINDOW // 2
     window = torch.exp(-offset.square() / (2 * SSIM_SIGMA**2))
     window = window / window.sum()
@@ -64,11 +68,11 @@ def ssim(image: Tensor, truth: Tensor, mask: Tensor) -> float:
 def gradient_ratio(image: Tensor, truth: Tensor, mask: Tensor) -> float:
     """Mean luminance gradient (Sobel) of the image over that of the truth: below 1 blurred, above 1 noisy or seamy.
 
-    Counts pixels whose whole 3x3 neighborhood lies in the mask; 1 when neither image has a gradient there.
+    Counts pixels whose whole 5x5 neighborhood lies in the mask; 1 when neither image has a gradient there.
     """
     _check(image, truth, mask)
-    inside = eroded(mask, 1)
-    ours, theirs = (float(_sobel(_luminance(picture))[inside].mean()) for picture in (image, truth))
+    inside = eroded(mask, GRADIENT_MARGIN)
+    ours, theirs = (float(gradient_magnitude(luminance(picture))[inside].mean()) for picture in (image, truth))
     return (ours + 1e-6) / (theirs + 1e-6)
 
 
@@ -76,19 +80,26 @@ def sharpness_ratio(image: Tensor, truth: Tensor, mask: Tensor) -> float:
     """Mean magnitude of the luminance's Laplacian, image over truth: the finest detail alone; otherwise as
     `gradient_ratio`."""
     _check(image, truth, mask)
-    inside = eroded(mask, 1)
+    inside = eroded(mask, GRADIENT_MARGIN)
     kernel = image.new_tensor([[0.0, 1.0, 0.0], [1.0, -4.0, 1.0], [0.0, 1.0, 0.0]])
-    ours, theirs = (float(_filtered(_luminance(picture), kernel).abs()[inside].mean()) for picture in (image, truth))
+    ours, theirs = (float(_filtered(luminance(picture), kernel).abs()[inside].mean()) for picture in (image, truth))
     return (ours + 1e-6) / (theirs + 1e-6)
 
 
-def nearest_patch_loss(image: Tensor, truth: Tensor) -> float:
+def nearest_patch_loss(
+    image: Tensor, truth: Tensor, mask: Tensor | None = None, *, queries: int | None = None, seed: int = 0
+) -> float:
     """The paper's nearest patch loss (section 4.1): how far each 7x7 patch of the image is from the truth's nearest.
 
     L2 distance over the square root of the patch's 147 numbers, in levels of 0 to 255, mean over all patches that lie
-    within the image. The images may differ in size. Cost grows with the product of their pixel counts.
+    within the image, or over `queries` of them drawn with `seed`; always against all patches of the truth. mask:
+    patches count that lie in it entirely, in both images; without one the images may differ in size. Cost grows with
+    the product of the patch counts. NaN when there is no patch.
     """
-    ours, theirs = _patches(image), _patches(truth)
+    ours = _patches(image, _patch_corners(image, mask, queries, seed))
+    theirs = _patches(truth, _patch_corners(truth, mask))
+    if len(ours) == 0:
+        return math.nan
     # |a - b|^2 = |a|^2 + |b|^2 - 2ab suffers from cancellation unless both sides are centred.
     center = theirs.mean(0)
     ours, theirs = ours - center, theirs - center
@@ -106,22 +117,19 @@ def sliced_wasserstein(image: Tensor, truth: Tensor, mask: Tensor | None = None,
 
     Patches become vectors of 147 numbers; along each of PROJECTIONS random unit vectors both sets are sorted and the
     mean absolute difference is taken. Where things lie does not matter, only what they look like: blur and noise
-    show, a shift does not. mask: patches count that lie in it entirely.
+    show, a shift does not. mask: patches count that lie in it entirely. NaN when there is none.
     """
     assert image.shape == truth.shape
-    ours, theirs = _patches(image), _patches(truth)
-    if mask is not None:
-        whole = eroded(mask, PATCH // 2)
-        edge = PATCH // 2
-        keep = whole[edge:-edge, edge:-edge].flatten()
-        ours, theirs = ours[keep], theirs[keep]
-    if len(ours) == 0:
+    corners = _patch_corners(image, mask, MAX_PATCHES, seed)
+    if len(corners) == 0:
         return math.nan
     generator = torch.Generator().manual_seed(seed)
-    directions = torch.randn(ours.shape[1], PROJECTIONS, generator=generator).to(ours)
+    directions = torch.randn(PATCH * PATCH * 3, PROJECTIONS, generator=generator).to(image.device)
     directions = directions / directions.norm(dim=0)
     # NumPy sorts float32 ten times as fast as torch on a CPU.
-    ordered = [np.sort((directions.T @ patches.T).cpu().numpy(), axis=1) for patches in (ours, theirs)]
+    ordered = [
+        np.sort((directions.T @ _patches(picture, corners).T).cpu().numpy(), axis=1) for picture in (image, truth)
+    ]
     return float(np.abs(ordered[0] - ordered[1]).mean())
 
 
@@ -166,8 +174,15 @@ def _unit(image: Tensor) -> Tensor:
     return image.to(torch.float32) / (255 if image.dtype == torch.uint8 else 1)
 
 
-def _luminance(image: Tensor) -> Tensor:
+def luminance(image: Tensor) -> Tensor:
+    """[H,W,3] -> [H,W] float32."""
     return image.to(torch.float32) @ torch.tensor(LUMINANCE, device=image.device)
+
+
+def gradient_magnitude(plane: Tensor) -> Tensor:
+    """Length of the Sobel gradient of a plane [H,W], per pixel."""
+    kernel = plane.new_tensor([[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]]) / 8
+    return torch.hypot(_filtered(plane, kernel), _filtered(plane, kernel.T))
 
 
 def _filtered(plane: Tensor, kernel: Tensor) -> Tensor:
@@ -175,13 +190,22 @@ def _filtered(plane: Tensor, kernel: Tensor) -> Tensor:
     return F.conv2d(padded, kernel[None, None])[0, 0]
 
 
-def _sobel(plane: Tensor) -> Tensor:
-    """Gradient magnitude per pixel."""
-    kernel = plane.new_tensor([[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]]) / 8
-    return torch.hypot(_filtered(plane, kernel), _filtered(plane, kernel.T))
+def _patch_corners(image: Tensor, mask: Tensor | None, most: int | None = None, seed: int = 0) -> Tensor:
+    """Flat indices [N] of the first pixels of the patches inside image and mask, row by row; at most `most`, drawn."""
+    height, width = image.shape[:2]
+    whole = torch.ones((height, width), dtype=torch.bool, device=image.device) if mask is None else mask
+    edge = PATCH // 2
+    rows, columns = eroded(whole, edge).nonzero().unbind(1)
+    corners = (rows - edge) * width + columns - edge
+    if most is None or len(corners) <= most:
+        return corners
+    drawn = torch.randperm(len(corners), generator=torch.Generator().manual_seed(seed))[:most]
+    return corners[drawn.to(corners.device)]
 
 
-def _patches(image: Tensor) -> Tensor:
-    """All 7x7 patches inside the image, row by row, as [N,147] in levels of 0 to 255."""
-    planes = image.to(torch.float32).permute(2, 0, 1)[None] * 255
-    return F.unfold(planes, PATCH)[0].T
+def _patches(image: Tensor, corners: Tensor) -> Tensor:
+    """The 7x7 patches whose first pixels are `corners` [N] (flat indices), as [N,147] in levels of 0 to 255."""
+    steps = torch.arange(PATCH, device=image.device)
+    offsets = (steps[:, None] * image.shape[1] + steps).flatten()
+    flat = image.reshape(-1, 3).to(torch.float32) * 255
+    return flat[corners[:, None] + offsets].flatten(1)

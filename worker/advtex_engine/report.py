@@ -14,18 +14,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from advtex_engine.checkpoint import WorkFolder
 from advtex_engine.errors import Problem, Stopped
+from advtex_engine.evaluate import configured_lpips, score_views
 from advtex_engine.files import write_atomically
-from advtex_engine.metrics import score_views
 from advtex_engine.monitor import Monitor
-from advtex_engine.previews import contact_sheet, evenly_spread, render_layers, render_view, side_by_side
-from advtex_engine.rasterize import rasterize
+from advtex_engine.previews import contact_sheet, evenly_spread, render_view, side_by_side
 from advtex_engine.scene import Atlas, Camera, Mesh, Scene, View
-from advtex_engine.views import DEPTH_TOLERANCE
 
 SHEET_VIEWS = 6
 
@@ -133,24 +130,15 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
 def heldout_scores(scene: Scene, atlas: Atlas, texture: Tensor, mean: Tensor) -> dict[str, Any] | None:
     """Scores of the held-out views for the texture and for the projected mean; None when no view was held out.
 
-    A pixel counts where the mesh is hit and the device's depth, where there is one, agrees with it.
+    Those of `evaluate.score_views`; `missing` says why a metric has none.
     """
     if not scene.heldout:
         return None
-    photos, masks = [], []
-    for view in scene.heldout:
-        fragments = rasterize(atlas.mesh, view.camera)
-        mask = fragments.face_index >= 0
-        if view.depth is not None:
-            agrees = (view.depth - fragments.depth).abs() < DEPTH_TOLERANCE[scene.kind]
-            mask = mask & ((view.depth == 0) | agrees)
-        photos.append(view.color.to(torch.float32) / 255)
-        masks.append(mask)
-    scores = {}
-    for name, candidate in (("texture", texture), ("mean", mean)):
-        renders = [render_layers(atlas, candidate, view.camera)[0] for view in scene.heldout]
-        scores[name] = score_views(renders, photos, masks)
-    return scores
+    lpips, missing = configured_lpips()
+    return {
+        name: score_views(atlas, candidate, scene.heldout, lpips) | {"missing": missing}
+        for name, candidate in (("texture", texture), ("mean", mean))
+    }
 
 
 def write_previews(out: Path, scene: Scene, atlas: Atlas, texture: Tensor, mean: Tensor) -> tuple[Path, ...]:

@@ -1,0 +1,204 @@
+"""Which views show a face well: the data term of view selection.
+
+Each face is looked at in POINTS places, three corners, three edge midpoints and the centroid, which are shared between
+faces. A view is a candidate for a face when it sees all of them. Of the candidates the best K are kept while the views
+go by, so that memory does not grow with the number of views; then those that disagree with the others are marked down.
+
+The data term is a sum of logarithms, each the factor by which another view of the same face is better:
+resolution (square root of the projected area), frontality, sharpness of the frame, distance from depth
+discontinuities and from the image's border, and agreement in color with the face's other candidates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from advtex_engine.reproject import MIN_DEPTH
+from advtex_engine.scene import Mesh
+from advtex_engine.texture import bilinear_footprint
+from advtex_engine.views import ViewMaps
+
+POINTS = 7
+KEPT_VIEWS = 16
+NO_VIEW = 1e4  # data term of an empty place
+# Of theta_z, the tolerance of reprojection between views: what is hidden by less than this counts as seen.
+OCCLUSION_SHARE = 0.3
+# Pixels from an edge of the view's surface at which a place is as good as any: poses and depth are off by some pixels.
+SAFE_DISTANCE = 8
+# Neighboring pixels whose depths differ by more than this share of the depth belong to different surfaces.
+DEPTH_JUMP = 0.03
+GRAZING_WEIGHT = 0.5
+EDGE_WEIGHT = 1.0
+SHARPNESS_WEIGHT = 1.0
+AGREEMENT_WEIGHT = 1.0
+AGREEMENT_ROUNDS = 4
+AGREEMENT_SCALE = 0.05  # least deviation in color, of 1, that counts as disagreement
+MAX_DISAGREEMENT = 3.0
+
+
+@dataclass(frozen=True)
+class FacePoints:
+    """The places at which faces are looked at: position [P,3] world metres, index [T,7] of each face's.
+
+    Order: corners 0, 1, 2; midpoints of the sides 0-1, 1-2, 2-0; centroid.
+    """
+
+    position: Tensor
+    index: Tensor
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """The best K views of each of T faces, in no order.
+
+    view: [T,K] int64, -1 = none. cost: [T,K] float32, the data term; NO_VIEW where none.
+    color: [T,K,7,3] uint8, what the view shows at the face's places.
+    """
+
+    view: Tensor
+    cost: Tensor
+    color: Tensor
+
+
+def face_points(mesh: Mesh) -> FacePoints:
+    """Corners, edge midpoints and centroids; neighbors share corners and midpoints."""
+    corners = mesh.t_pos_idx
+    count = len(mesh.v_pos)
+    ends = torch.stack((corners, corners.roll(-1, 1)), 2).sort(2).values
+    keys, side = torch.unique(ends[..., 0] * count + ends[..., 1], return_inverse=True)
+    midpoint = (mesh.v_pos[keys // count] + mesh.v_pos[keys % count]) / 2
+    centroid = mesh.v_pos[corners].mean(1)
+    own = torch.arange(len(corners), device=corners.device)[:, None] + count + len(keys)
+    return FacePoints(torch.cat((mesh.v_pos, midpoint, centroid)), torch.cat((corners, side + count, own), 1))
+
+
+def find_candidates(mesh: Mesh, maps: ViewMaps, tolerance: float) -> Candidates:
+    """The best KEPT_VIEWS views of each face and their data terms.
+
+    tolerance: theta_z in metres. maps: at the size that the texture is sampled from. Not differentiable.
+    """
+    points = face_points(mesh)
+    faces, device = len(mesh.t_pos_idx), mesh.v_pos.device
+    corners = mesh.v_pos[mesh.t_pos_idx]
+    normal = F.normalize(torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), dim=1)
+    kept = Candidates(
+        torch.full((faces, KEPT_VIEWS), -1, device=device),
+        torch.full((faces, KEPT_VIEWS), NO_VIEW, device=device),
+        torch.zeros((faces, KEPT_VIEWS, POINTS, 3), dtype=torch.uint8, device=device),
+    )
+    blur = frame_blur(maps)
+    for view in range(maps.count):
+        _look(view, points, normal, maps, float(blur[view]), tolerance * OCCLUSION_SHARE, kept)
+    return Candidates(kept.view, kept.cost + disagreement(kept.color, kept.view >= 0), kept.color)
+
+
+def _look(
+    view: int, points: FacePoints, normal: Tensor, maps: ViewMaps, blur: float, tolerance: float, kept: Candidates
+) -> None:
+    """Puts a view into the places of worse ones, for the faces that it sees whole."""
+    pixel, depth, ray = _project(points.position, maps, view)
+    safety = edge_distance(maps.depth[view].view(maps.height, maps.width).to(torch.float32)) / SAFE_DISTANCE
+    safe, color = _sample(pixel, depth, safety, maps, view, tolerance)
+    seen = safe[points.index].amin(1)
+    face = (seen > 0).nonzero()[:, 0]
+    index = points.index[face]
+    a, b, c = pixel[index[:, :3]].unbind(1)
+    area = ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]).abs() / 2
+    cosine = (normal[face] * ray[index[:, 6]]).sum(1).abs()
+    cost = -0.5 * area.clamp(min=1e-6).log() - GRAZING_WEIGHT * cosine.clamp(min=1e-3).log()
+    cost += EDGE_WEIGHT * (1 - seen[face]) + SHARPNESS_WEIGHT * blur
+    worst, place = kept.cost[face].max(1)
+    better = cost < worst
+    face, place = face[better], place[better]
+    kept.view[face, place] = view
+    kept.cost[face, place] = cost[better]
+    kept.color[face, place] = color[index[better]]
+
+
+def _project(position: Tensor, maps: ViewMaps, view: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Pixels [P,2], depth [P] and unit viewing rays [P,3] (world) of world points."""
+    pose = maps.world_to_camera[view]
+    center = (-pose[:3, :3].T @ pose[:3, 3]).to(position)
+    from_center = position - center
+    seen = from_center @ pose[:3, :3].T.to(position)
+    focal, principal = maps.intrinsics[view, :2], maps.intrinsics[view, 2:]
+    depth = seen[:, 2]
+    pixel = seen[:, :2] / torch.where(depth > MIN_DEPTH, depth, 1.0)[:, None] * focal + principal
+    return pixel, depth, F.normalize(from_center, dim=1)
+
+
+def _sample(
+    pixel: Tensor, depth: Tensor, safety: Tensor, maps: ViewMaps, view: int, tolerance: float
+) -> tuple[Tensor, Tensor]:
+    """Safety [P] in [0,1], 0 where the view does not see the point, and its color [P,3] uint8."""
+    inside = (depth > MIN_DEPTH) & (pixel > 0.5).all(1) & (pixel[:, 0] < maps.width - 0.5)
+    which = (inside & (pixel[:, 1] < maps.height - 0.5)).nonzero()[:, 0]
+    indices, weights = bilinear_footprint(pixel[which], maps.width, maps.height)
+    surface = maps.depth[view].to(torch.float32)[indices]
+    # The farthest of four pixels decides, or else every point beside an occluding edge would count as hidden.
+    apart = torch.where(surface > 0, (surface - depth[which, None]).abs(), torch.inf).amin(1)
+    reliable = (safety.flatten()[indices] * weights).sum(1).clamp(min=1e-3)
+    safe = torch.zeros_like(depth)
+    safe[which] = torch.where(apart < tolerance, reliable, 0.0)
+    color = torch.zeros((len(pixel), 3), dtype=torch.uint8, device=pixel.device)
+    image = maps.color[view].to(torch.float32)
+    color[which] = F.embedding_bag(indices, image, per_sample_weights=weights, mode="sum").round().to(torch.uint8)
+    return safe, color
+
+
+def edge_distance(depth: Tensor) -> Tensor:
+    """[H,W] pixels (chessboard) to the nearest border, hole or discontinuity of a depth map, at most SAFE_DISTANCE."""
+    solid = torch.where(depth > 0, depth, torch.inf)[None]
+    near, far = -F.max_pool2d(-solid, 3, 1, 1), F.max_pool2d(depth[None], 3, 1, 1)
+    edge = ((depth[None] == 0) | (far > near * (1 + DEPTH_JUMP))).to(torch.float32)
+    edge = F.pad(edge, (1, 1, 1, 1), value=1.0)
+    distance = torch.zeros_like(edge)
+    for _ in range(SAFE_DISTANCE):
+        distance += 1 - edge
+        edge = F.max_pool2d(edge, 3, 1, 1)
+    return distance[0, 1:-1, 1:-1]
+
+
+def luminance(color: Tensor) -> Tensor:
+    """[...,3] uint8 -> [...] float32 in [0,1] (Rec. 601 weights, of the sRGB values)."""
+    return color.to(torch.float32) @ torch.tensor([0.299, 0.587, 0.114], device=color.device) / 255
+
+
+def frame_blur(maps: ViewMaps) -> Tensor:
+    """[V] how much blurrier each frame is than the median frame: a logarithm, 0 for the sharper half.
+
+    The ratio of the energies of fine and of coarse detail falls with motion blur and depends little on the content.
+    """
+    ratios = []
+    for view in range(maps.count):
+        gray = luminance(maps.color[view]).view(1, 1, maps.height, maps.width)
+        coarse = F.avg_pool2d(gray, 2)
+        ratios.append(_gradient(gray) / _gradient(coarse).clamp(min=1e-6))
+    ratio = torch.stack(ratios).clamp(min=1e-6).log()
+    return (ratio.median() - ratio).clamp(min=0)
+
+
+def _gradient(gray: Tensor) -> Tensor:
+    """Root of the mean squared difference of neighbors."""
+    return ((gray.diff(dim=2) ** 2).mean() + (gray.diff(dim=3) ** 2).mean()).sqrt()
+
+
+def disagreement(color: Tensor, valid: Tensor) -> Tensor:
+    """[T,K] how far each view's colors lie from those that most views of the face show, 0 to MAX_DISAGREEMENT.
+
+    color: [T,K,7,3] uint8; valid: [T,K] bool. The consensus is a mean with weights exp(-d^2 / 2 s^2) found by
+    repetition, s the root mean square deviation so far but at least AGREEMENT_SCALE.
+    """
+    values = color.to(torch.float32).flatten(2) / 255
+    weight = valid.to(torch.float32)
+    for _ in range(AGREEMENT_ROUNDS):
+        total = weight.sum(1, keepdim=True).clamp(min=1e-6)
+        mean = (values * weight[..., None]).sum(1, keepdim=True) / total[..., None]
+        squared = ((values - mean) ** 2).mean(2)
+        scale = ((squared * weight).sum(1, keepdim=True) / total).clamp(min=AGREEMENT_SCALE**2)
+        weight = torch.exp(-squared / (2 * scale)) * valid
+    return AGREEMENT_WEIGHT * torch.where(valid, (squared / AGREEMENT_SCALE**2 / 2).clamp(max=MAX_DISAGREEMENT), 0.0)

@@ -72,7 +72,11 @@ METHODS = (
     "adversarial",
     "adversarial_no_auxiliary",
     "adversarial_no_condition",
+    "best_view",
+    "l1",
     "mean",
+    "sharpest",
+    "view_selection",
 )
 
 

@@ -7,8 +7,12 @@ from collections.abc import Callable
 from torch import Tensor
 
 from advtex_engine.methods.adversarial import adversarial, adversarial_no_auxiliary, adversarial_no_condition
+from advtex_engine.methods.best_view import best_view
 from advtex_engine.methods.inputs import LossPoint, MethodInput
+from advtex_engine.methods.l1 import l1
 from advtex_engine.methods.mean import mean
+from advtex_engine.methods.sharpest import sharpest
+from advtex_engine.methods.view_selection import view_selection
 
 Method = Callable[[MethodInput], tuple[Tensor, list[LossPoint]]]
 
@@ -16,7 +20,11 @@ METHODS: dict[str, Method] = {
     "adversarial": adversarial,
     "adversarial_no_auxiliary": adversarial_no_auxiliary,
     "adversarial_no_condition": adversarial_no_condition,
+    "best_view": best_view,
+    "l1": l1,
     "mean": mean,
+    "sharpest": sharpest,
+    "view_selection": view_selection,
 }
 
 __all__ = ["METHODS", "LossPoint", "Method", "MethodInput"]

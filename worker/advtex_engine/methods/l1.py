@@ -1,0 +1,51 @@
+"""The texture of least L1 distance to all photographs: what robust averaging can do, and no more (paper section 4).
+
+The distance is taken at the pixels, where the texture is sampled bilinearly, and not per texel: a median per texel of
+the colors splatted onto it would blur them by the splat's footprint. The problem is convex; Adam with a learning rate
+that falls to zero settles at its minimum.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from advtex_engine.methods.descent import descend
+from advtex_engine.methods.inputs import LossPoint, MethodInput
+from advtex_engine.texture import bilinear_footprint, decode_uv, sample_texels
+from advtex_engine.views import ViewMaps
+
+PASSES = 20  # over all views, unless the number of steps is asked for
+
+
+def l1(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
+    """One view per step, all views in a new random order per pass -> [H,W,3] float32 in [0,1] and the losses.
+
+    Raises Stopped, after a checkpoint.
+    """
+    maps, device = given.maps[1], given.maps[1].color.device
+    generator = torch.Generator().manual_seed(given.config.seed)
+    seen = [view for view in range(maps.count) if bool((maps.depth[view] > 0).any())]
+    steps = given.config.steps or PASSES * len(seen)
+    order = [seen[index] for _ in range(-(-steps // len(seen))) for index in _shuffled(len(seen), generator)]
+    size = torch.tensor(maps.slot_map.shape[::-1], dtype=torch.float32, device=device)
+
+    def distance(values: Tensor, step: int) -> Tensor:
+        photograph, slots, weights = _footprints(maps, order[step], size)
+        return (sample_texels(values, slots, weights) - photograph).abs().mean()
+
+    return descend(given, "l1", distance, steps, generator)
+
+
+def _shuffled(count: int, generator: torch.Generator) -> list[int]:
+    drawn: list[int] = torch.randperm(count, generator=generator).tolist()
+    return drawn
+
+
+def _footprints(maps: ViewMaps, view: int, size: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Colors [P,3] in [0,1] of a view's foreground, and where they sample the texture: slots [P,4], weights [P,4]."""
+    seen = maps.depth[view] > 0
+    height, width = maps.slot_map.shape
+    texels, weights = bilinear_footprint(decode_uv(maps.uv[view][seen]) * size, width, height)
+    slots = maps.slot_map.flatten()[texels].clamp(min=0)
+    return maps.color[view][seen].to(torch.float32) / 255, slots, weights

@@ -102,7 +102,8 @@ def test_a_stopped_run_resumes_to_the_same_bytes_without_redoing_earlier_stages(
     assert "atlas" not in again.stages
     assert (tmp_path / "model.png").read_bytes() == (whole[0] / "model.png").read_bytes()
     report = json.loads((tmp_path / "report.json").read_text())
-    assert [stage["stage"] for stage in report["stages"] if stage["resumed"]] == ["ingest", "geometry", "atlas"]
+    resumed = [stage["stage"] for stage in report["stages"] if stage["resumed"]]
+    assert resumed == ["ingest", "geometry", "refinement", "atlas"]
     assert [point["step"] for point in report["losses"]] == list(range(1, STEPS + 1))
 
 

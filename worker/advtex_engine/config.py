@@ -90,6 +90,7 @@ class TextureConfig:
     steps             overrides the preset's step count, its levels scaled in proportion
     face_budget       the mesh is decimated to at most this many faces
     max_texture_size  cap on the texture's side in texels
+    refine            cameras and exposures are refined first (never for the preset "paper", which stays as published)
     """
 
     preset: str = "auto"
@@ -100,6 +101,7 @@ class TextureConfig:
     face_budget: int = 80_000
     max_texture_size: int = 4096
     texels_per_pixel: float = 1.2
+    refine: bool = True
     device: str = "auto"
     seed: int = 0
     checkpoint_seconds: float = 30.0

@@ -10,6 +10,7 @@ from advtex_engine.errors import Problem
 STAGES = (
     "ingest",
     "geometry",
+    "refinement",
     "atlas",
     "view_maps",
     "initial_texture",

@@ -1,6 +1,7 @@
 """The stages, in reading order: from a scan's files to a textured model.
 
-ingest -> geometry -> atlas -> view maps -> initial texture -> optimization -> dilation -> export -> previews
+ingest -> geometry -> refinement -> atlas -> view maps -> initial texture -> optimization -> dilation -> export
+-> previews
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from advtex_engine.ingest import ingest
 from advtex_engine.methods import METHODS, MethodInput
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.monitor import Monitor
+from advtex_engine.refine import apply_refinement, refine_cameras, refinement_from_dict, refinement_to_dict
 from advtex_engine.report import (
     Stages,
     WarningKeeper,
@@ -67,7 +69,9 @@ def texture_scan(
     out.mkdir(parents=True, exist_ok=True)
     stages = Stages(monitor, folder)
 
-    scene, atlas = _prepare(scan, config, folder, stages, monitor)
+    scene = _load_scene(scan, config, folder, stages, monitor)
+    scene, refinement = _refine(scene, config, folder, stages, device)
+    atlas = _load_atlas(scene, config, folder, stages, monitor)
     atlas = replace(atlas, mesh=_mesh_to(atlas.mesh, device))
     maps = _view_maps(scene, atlas, preset, folder, stages, device)
     with stages.run("initial_texture"):
@@ -86,6 +90,7 @@ def texture_scan(
         scores = heldout_scores(scene, atlas, texture, mean)
     parts = {
         "scan": describe_scene(scene),
+        "refinement": refinement,
         "atlas": {key: getattr(atlas, key) for key in ("width", "height", "source", "charts")},
         "touched_texels": maps[1].slots,
         "stages": stages.records,
@@ -131,25 +136,48 @@ def fingerprint(scan: Path, config: TextureConfig) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def _prepare(
-    scan: Path, config: TextureConfig, folder: WorkFolder, stages: Stages, monitor: Monitor
-) -> tuple[Scene, Atlas]:
+def _load_scene(scan: Path, config: TextureConfig, folder: WorkFolder, stages: Stages, monitor: Monitor) -> Scene:
     saved = folder.load("scene")
     if saved is not None:
-        scene = scene_from_dict(saved)
         stages.restore("ingest", "geometry")
-    else:
-        with stages.run("ingest"):
-            scene = ingest(scan, config, monitor)
-        with stages.run("geometry"):
-            scene = replace(scene, mesh=decimate(clean(scene.mesh), config.face_budget, monitor))
-        folder.save("scene", scene_to_dict(scene))
-        stages.save()
+        return scene_from_dict(saved)
+    with stages.run("ingest"):
+        scene = ingest(scan, config, monitor)
+    with stages.run("geometry"):
+        scene = replace(scene, mesh=decimate(clean(scene.mesh), config.face_budget, monitor))
+    folder.save("scene", scene_to_dict(scene))
+    stages.save()
+    return scene
+
+
+def _refine(
+    scene: Scene, config: TextureConfig, folder: WorkFolder, stages: Stages, device: torch.device
+) -> tuple[Scene, dict[str, Any] | None]:
+    """The scene with refined cameras and exposures, and the report's part about them; None when it was not asked for.
+
+    What was found is small and cached by itself: the scene as it came stays in its own cache.
+    """
+    if not config.refine or config.preset == "paper":
+        return scene, None
+    saved = folder.load("refinement")
+    if saved is not None:
+        stages.restore("refinement")
+        refinement = refinement_from_dict(saved)
+        return apply_refinement(scene, refinement), refinement.report
+    with stages.run("refinement"):
+        refinement = refine_cameras(scene, device, config.seed)
+        refined = apply_refinement(scene, refinement)
+    folder.save("refinement", refinement_to_dict(refinement))
+    stages.save()
+    return refined, refinement.report
+
+
+def _load_atlas(scene: Scene, config: TextureConfig, folder: WorkFolder, stages: Stages, monitor: Monitor) -> Atlas:
     saved = folder.load("atlas")
     if saved is not None:
         stages.restore("atlas")
         mesh = Mesh(scene.mesh.v_pos, saved["t_pos_idx"], saved["v_uv"], saved["t_uv_idx"])
-        return scene, Atlas(mesh, saved["width"], saved["height"], saved["source"], saved["charts"])
+        return Atlas(mesh, saved["width"], saved["height"], saved["source"], saved["charts"])
     with stages.run("atlas"):
         atlas = build_atlas(scene.mesh, [view.camera for view in scene.views], config, monitor)
     folder.save(
@@ -165,7 +193,7 @@ def _prepare(
         },
     )
     stages.save()
-    return scene, atlas
+    return atlas
 
 
 def _view_maps(

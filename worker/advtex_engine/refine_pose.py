@@ -1,0 +1,131 @@
+"""Rigid camera poses from photoconsistency (Zhou & Koltun 2014, "Color Map Optimization", section 3).
+
+Each view may move by a twist (rotation, translation) in its own camera frame; a Gauss-Newton step moves all at once
+(`refine_solve`). The value compared is the luminance with its local mean and contrast removed, so that exposure and
+white balance do not matter.
+Parameters are scaled to about a pixel: a twist of (1/f, 1/f, 1/f, z/f, z/f, z/f), z the view's median depth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from advtex_engine.refine_points import Observations
+from advtex_engine.refine_solve import residuals, solve_views
+
+LEVELS = ((8, 6), (4, 6), (2, 5), (1, 4))  # shrink factor of the image, Gauss-Newton steps
+CONTRAST_RADIUS = 4  # pixels of the level around which local mean and contrast are taken
+CONTRAST_FLOOR = 0.04  # of the range: what is flatter than that counts less
+ROBUST_SCALE = 0.3  # residual, in local contrasts, at which an observation loses half of its weight
+DAMPING = 1e-3  # of the diagonal
+LARGEST_STEP = 4.0  # pixels of the level
+
+
+@dataclass(frozen=True)
+class Looks:
+    """What V views see at their K points.
+
+    value: [V,K]. gradient: [V,K,2] of the value per pixel of the working size. pixel: [V,K,2]. local: [V,K,3] metres in
+    the camera's frame. valid: [V,K] bool, False where pad or outside of the image.
+    """
+
+    value: Tensor
+    gradient: Tensor
+    pixel: Tensor
+    local: Tensor
+    valid: Tensor
+
+
+def local_contrast(luminance: Tensor, scale: int) -> Tensor:
+    """[V,h,w] in [0,1] -> [V,3,h/scale,w/scale]: normalized value and its gradient per pixel of the full image."""
+    image = luminance[:, None]
+    height, width = image.shape[2:]
+    if scale > 1:
+        image = F.interpolate(image, (max(8, height // scale), max(8, width // scale)), mode="area")
+    image = _blurred(image, 1)
+    mean = _blurred(image, CONTRAST_RADIUS)
+    deviation = (_blurred(image.square(), CONTRAST_RADIUS) - mean.square()).clamp(min=0).sqrt()
+    value = (image - mean) / (deviation + CONTRAST_FLOOR)
+    padded = F.pad(value, (1, 1, 1, 1), mode="replicate")
+    across = (padded[:, :, 1:-1, 2:] - padded[:, :, 1:-1, :-2]) * (0.5 * image.shape[3] / width)
+    down = (padded[:, :, 2:, 1:-1] - padded[:, :, :-2, 1:-1]) * (0.5 * image.shape[2] / height)
+    return torch.cat((value, across, down), 1)
+
+
+def _blurred(image: Tensor, radius: int) -> Tensor:
+    """[V,1,h,w] smoothed by a Gaussian that is cut off at two standard deviations, `radius` pixels."""
+    offset = torch.arange(-radius, radius + 1, device=image.device, dtype=image.dtype)
+    kernel = torch.exp(-2 * (offset / radius).square())
+    kernel = kernel / kernel.sum()
+    padded = F.pad(image, (radius,) * 4, mode="replicate")
+    return F.conv2d(F.conv2d(padded, kernel.view(1, 1, 1, -1)), kernel.view(1, 1, -1, 1))
+
+
+def look(features: Tensor, K: Tensor, world_to_camera: Tensor, points: Observations, size: tuple[int, int]) -> Looks:
+    """Samples `local_contrast` where the views see their points; K [V,3,3] is for images of `size` (width, height)."""
+    world = points.position[points.point]
+    local = world @ world_to_camera[:, :3, :3].mT + world_to_camera[:, None, :3, 3]
+    z = local[..., 2].clamp(min=1e-6)
+    homogeneous = local @ K.mT
+    uv = (homogeneous[..., :2] / z[..., None]).float()
+    extent = uv.new_tensor(size)
+    valid = points.seen & (local[..., 2] > 1e-6) & ((uv > 1) & (uv < extent - 1)).all(-1)
+    found = F.grid_sample(features, (2 * uv / extent - 1)[:, :, None], padding_mode="border", align_corners=False)
+    value, across, down = found[..., 0].unbind(1)
+    return Looks(value, torch.stack((across, down), -1), uv, local.float(), valid)
+
+
+def refine_poses(luminance: Tensor, K: Tensor, world_to_camera: Tensor, points: Observations) -> Tensor:
+    """world_to_camera [V,4,4] float64 that make the views agree; coarse to fine.
+
+    luminance: [V,h,w] float32 in [0,1]. K: [V,3,3] float64 for that size. The mean motion of all cameras is free here.
+    """
+    size = (luminance.shape[2], luminance.shape[1])
+    for scale, steps in LEVELS:
+        features = local_contrast(luminance, scale)
+        for _ in range(steps):
+            looks = look(features, K, world_to_camera, points, size)
+            residual, weight = residuals(looks.value, looks.valid, points, ROBUST_SCALE)
+            unit = _units(looks, K)
+            jacobian = _jacobian(looks, K) * unit[..., None]
+            strength = (jacobian.square() @ weight[..., None])[..., 0]
+            # A view without any point gets a prior alone and, its right side being 0, does not move.
+            damping = DAMPING * strength + 1e-6 * strength.mean() + 1e-12
+            step = solve_views(jacobian, residual, weight, points, damping, torch.zeros_like(damping))
+            longest = step.norm(dim=1).clamp(min=1e-12)
+            step = step * (LARGEST_STEP * scale / longest).clamp(max=1)[:, None]
+            world_to_camera = exponential((step * unit).double()) @ world_to_camera
+    return world_to_camera
+
+
+def _units(looks: Looks, K: Tensor) -> Tensor:
+    """The twist [V,6] that each parameter stands for."""
+    focal = K[:, 0, 0].float()
+    depth = torch.where(looks.valid, looks.local[..., 2], torch.nan).nanmedian(1).values.nan_to_num(1.0)
+    return torch.stack((1 / focal,) * 3 + (depth / focal,) * 3, 1)
+
+
+def _jacobian(looks: Looks, K: Tensor) -> Tensor:
+    """Derivative [V,6,K] of the value with respect to the twist (rotation, translation) in the camera's frame."""
+    x, y, z = looks.local.unbind(-1)
+    inverse = 1 / z.clamp(min=1e-6)
+    a = looks.gradient[..., 0] * K[:, 0, 0, None].float() * inverse
+    b = looks.gradient[..., 1] * K[:, 1, 1, None].float() * inverse
+    c = -(a * x + b * y) * inverse
+    return torch.stack((y * c - z * b, z * a - x * c, x * b - y * a, a, b, c), 1)
+
+
+def exponential(twist: Tensor) -> Tensor:
+    """Rigid motions [V,4,4] of twists [V,6] (rotation, translation); translation is applied after the rotation."""
+    motion = torch.zeros((len(twist), 4, 4), dtype=twist.dtype, device=twist.device)
+    x, y, z = twist[:, :3].unbind(1)
+    zero = torch.zeros_like(x)
+    skew = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), 1).view(-1, 3, 3)
+    motion[:, :3, :3] = torch.linalg.matrix_exp(skew)
+    motion[:, :3, 3] = twist[:, 3:]
+    motion[:, 3, 3] = 1
+    return motion

@@ -29,7 +29,7 @@ from advtex_client.errors import (
     WaitTimeoutError,
 )
 from advtex_contract.jobs import TERMINAL, JobState, JobView
-from advtex_contract.options import PRESET_HELP, JobOptions, Preset
+from advtex_contract.options import METHOD_HELP, PRESET_HELP, JobOptions, Method, Preset
 from advtex_scan.check import check_scan
 
 EXIT_CODES: dict[type[ClientError], int] = {
@@ -61,6 +61,7 @@ Url = Annotated[str | None, typer.Option("--url", help="the server; else ADVTEX_
 ApiKey = Annotated[str | None, typer.Option("--api-key", help="the key; better given as ADVTEX_API_KEY")]
 Seconds = Annotated[float | None, typer.Option("--timeout", min=0, help="stop waiting after this many seconds")]
 Folder = Annotated[Path | None, typer.Option("-o", "--output", help="fetch the results into this folder")]
+METHODS = "; ".join(f"{method}: {text}" for method, text in METHOD_HELP.items())
 PRESETS = "; ".join(f"{preset}: {text}" for preset, text in PRESET_HELP.items())
 
 
@@ -93,6 +94,7 @@ def check(scan: ScanPath, as_json: AsJson = False) -> None:
 def submit(
     scan: ScanPath,
     preset: Annotated[Preset, typer.Option(help=PRESETS)] = Preset.auto,
+    method: Annotated[Method, typer.Option(help=METHODS)] = Method.adversarial,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="working size of the views, pixels")] = None,
     holdout: Annotated[int | None, typer.Option(help="leave out every Nth frame and score on it")] = None,
     steps: Annotated[int | None, typer.Option(help="overrides the preset's step count")] = None,
@@ -113,6 +115,7 @@ def submit(
         width, height = _parsed_size(size)
         options = _options(
             preset=preset,
+            method=method,
             width=width,
             height=height,
             steps=steps,

@@ -27,12 +27,42 @@ PRESET_HELP: dict[Preset, str] = {
 }
 
 
+class Method(StrEnum):
+    """How the texture is made. All but `adversarial` are there to compare with it."""
+
+    adversarial = "adversarial"
+    adversarial_no_auxiliary = "adversarial_no_auxiliary"
+    adversarial_no_condition = "adversarial_no_condition"
+    best_view = "best_view"
+    colormap = "colormap"
+    l1 = "l1"
+    mean = "mean"
+    sharpest = "sharpest"
+    vgg = "vgg"
+    view_selection = "view_selection"
+
+
+METHOD_HELP: dict[Method, str] = {
+    Method.adversarial: "the texture is optimized against a patch discriminator",
+    Method.adversarial_no_auxiliary: "the same without auxiliary views: what they are worth",
+    Method.adversarial_no_condition: "the same without showing the discriminator the source view",
+    Method.best_view: "each face from the view that shows it largest",
+    Method.colormap: "refined cameras, then the mean",
+    Method.l1: "least absolute difference to all views",
+    Method.mean: "the mean of all views",
+    Method.sharpest: "each face from the sharpest view that sees it",
+    Method.vgg: "least difference in the features of VGG16, whose weights the worker must have",
+    Method.view_selection: "one view per face with few seams, leveled; in about a minute",
+}
+
+
 class JobOptions(BaseModel):
     """What a user may set. Everything has a default that suits most scans."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     preset: Preset = Preset.auto
+    method: Method = Method.adversarial
     width: int | None = Field(default=None, ge=64, le=4096, description="working width of the views, pixels")
     height: int | None = Field(default=None, ge=64, le=4096, description="working height of the views, pixels")
     steps: int | None = Field(default=None, ge=1, le=1_000_000, description="overrides the preset's step count")

@@ -90,6 +90,7 @@ def test_a_bad_scan_is_4_with_every_finding_and_its_remedy(server: FakeServer, s
         (["--max-texture-size", "100000"], "max_texture_size"),
         (["--face-budget", "1"], "face_budget"),
         (["--preset", "turbo"], "turbo"),
+        (["--method", "magic"], "magic"),
         (["--label", "two\nlines"], "label"),
     ],
 )

@@ -13,15 +13,20 @@ from pydantic import ValidationError
 
 from advtex_contract.errors import ErrorBody, ErrorCode, ErrorDetail
 from advtex_contract.jobs import TERMINAL, JobSpec, JobState, JobView
-from advtex_contract.options import PRESET_HELP, JobOptions, Preset
+from advtex_contract.options import METHOD_HELP, PRESET_HELP, JobOptions, Method, Preset
 
 
 def test_every_preset_is_explained() -> None:
     assert set(PRESET_HELP) == set(Preset)
 
 
+def test_every_method_is_explained() -> None:
+    assert set(METHOD_HELP) == set(Method)
+
+
 def test_defaults_suit_most_scans() -> None:
-    assert JobOptions().model_dump(exclude_none=True) == {"preset": "auto", "max_texture_size": 4096, "seed": 0}
+    defaults = {"preset": "auto", "method": "adversarial", "max_texture_size": 4096, "seed": 0}
+    assert JobOptions().model_dump(exclude_none=True) == defaults
 
 
 @pytest.mark.parametrize(
@@ -51,7 +56,7 @@ def test_half_a_size_is_refused(side: str) -> None:
         JobOptions.model_validate({side: 100})
 
 
-@pytest.mark.parametrize("options", [{"preset": "fastest"}, {"stpes": 3}])
+@pytest.mark.parametrize("options", [{"preset": "fastest"}, {"method": "magic"}, {"stpes": 3}])
 def test_unknown_options_are_refused(options: dict[str, object]) -> None:
     with pytest.raises(ValidationError, match=next(iter(options))):
         JobOptions.model_validate(options)

@@ -22,8 +22,11 @@ from advtex_engine.methods import METHODS, MethodInput
 from advtex_engine.methods.best_view import label_faces
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.sharpest import sharpness
+from advtex_engine.methods.vgg import WEIGHTS_VARIABLE, load_vgg
 from advtex_engine.monitor import Monitor
 from advtex_engine.optimize import AdversarialOptimizer
+from advtex_engine.perceptual import NETWORKS, WeightsError, load_features
+from advtex_engine.pipeline import texture_scan
 from advtex_engine.planar import planar_maps
 from advtex_engine.previews import render_view
 from advtex_engine.rasterize import rasterize
@@ -272,3 +275,61 @@ def test_the_ablations_run_and_differ(name: str, around: MethodInput) -> None:
     if name != "adversarial":
         whole, _ = METHODS["adversarial"](replace(around, work=WorkFolder(around.work.path / "2", "", Monitor())))
         assert not torch.equal(texture, whole)
+
+
+def feature_weights() -> dict[str, Tensor]:
+    """VGG16's table with random weights of a sensible scale: features differ where images do, as with trained ones."""
+    generator = torch.Generator().manual_seed(0)
+    table = {}
+    for layer in NETWORKS["vgg16"]:
+        fan = layer.inputs * layer.kernel**2
+        shape = (layer.outputs, layer.inputs, layer.kernel, layer.kernel)
+        table[f"features.{layer.number}.weight"] = torch.randn(shape, generator=generator) * math.sqrt(2 / fan)
+        table[f"features.{layer.number}.bias"] = torch.zeros(layer.outputs)
+    return table
+
+
+@pytest.fixture
+def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "weights"
+    folder.mkdir()
+    torch.save(feature_weights(), folder / "vgg16-397923af.pth")
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(folder))
+    return folder
+
+
+def test_vgg_comes_nearer_in_features_and_in_colors(around: MethodInput, weights: Path) -> None:
+    """From a gray start, since without errors the mean is the answer already."""
+    gray = torch.full_like(around.means[1], 0.5)
+    preset = replace(around.preset, levels=(PyramidLevel(25),))
+    texture, losses = METHODS["vgg"](replace(around, means={1: gray}, preset=preset))
+    assert losses[-1]["vgg"] < 0.9 * losses[0]["vgg"]
+    seen = around.maps[1].slot_map >= 0
+    before, after = ((start - truth())[seen].abs().mean() for start in (gray, texture))
+    assert after < 0.97 * before
+
+
+def test_the_truncated_network_gives_the_first_features_of_the_whole(weights: Path) -> None:
+    images = torch.rand((1, 3, 32, 32), generator=torch.Generator().manual_seed(0))
+    short, whole = load_vgg()(images), load_features("vgg16", weights)(images)
+    assert len(short) == 3
+    assert all(torch.equal(a, b) for a, b in zip(short, whole, strict=False))
+
+
+def test_vgg_without_weights_says_what_is_missing(
+    around: MethodInput, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path))
+    with pytest.raises(WeightsError, match=r"no weights: .* has no file vgg16-\*\.pth"):
+        METHODS["vgg"](around)
+    with pytest.raises(WeightsError, match="no weights"):
+        texture_scan(tmp_path, tmp_path / "out", TextureConfig(method="vgg"), work=tmp_path / "work")
+    assert not (tmp_path / "out").exists(), "it is said before anything is done"
+
+
+def test_colormap_always_refines_cameras() -> None:
+    assert TextureConfig(method="colormap", refine=False).refines
+    assert TextureConfig(method="colormap", preset="paper").refines
+    assert TextureConfig(method="mean").refines
+    assert not TextureConfig(method="mean", refine=False).refines
+    assert not TextureConfig(preset="paper").refines

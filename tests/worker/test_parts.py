@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from advtex_contract.jobs import Progress
-from advtex_contract.options import JobOptions, Preset
+from advtex_contract.options import JobOptions, Method, Preset
 from advtex_engine import config as engine
 from advtex_engine.monitor import STAGES
 from advtex_store.errors import StaleAttempt
@@ -58,6 +58,10 @@ def test_presets_of_users_and_engine_are_the_same() -> None:
     assert {preset.value for preset in Preset} == {"auto", *engine.PRESETS}
 
 
+def test_methods_of_users_and_engine_are_the_same() -> None:
+    assert {method.value for method in Method} == set(engine.METHODS)
+
+
 BOUNDS = {"width": 64, "height": 64, "steps": 1, "face_budget": 100, "max_texture_size": 256, "holdout": 2}
 
 
@@ -71,6 +75,7 @@ def test_the_engine_takes_what_the_contract_takes_at_its_bounds(name: str) -> No
 
 @given(
     st.sampled_from(Preset),
+    st.sampled_from(Method),
     st.integers(64, 4096),
     st.integers(64, 4096),
     st.integers(2, 1000),
@@ -78,13 +83,21 @@ def test_the_engine_takes_what_the_contract_takes_at_its_bounds(name: str) -> No
     st.none() | st.integers(100, 2_000_000),
 )
 def test_every_option_arrives(
-    preset: Preset, width: int, height: int, holdout: int, seed: int, face_budget: int | None
+    preset: Preset, method: Method, width: int, height: int, holdout: int, seed: int, face_budget: int | None
 ) -> None:
     options = JobOptions(
-        preset=preset, width=width, height=height, holdout=holdout, seed=seed, face_budget=face_budget, steps=9
+        preset=preset,
+        method=method,
+        width=width,
+        height=height,
+        holdout=holdout,
+        seed=seed,
+        face_budget=face_budget,
+        steps=9,
     )
     config = texture_config(options, "cuda:1")
-    assert (config.preset, config.size, config.holdout, config.seed) == (preset.value, (width, height), holdout, seed)
+    assert (config.preset, config.method) == (preset.value, method.value)
+    assert (config.size, config.holdout, config.seed) == ((width, height), holdout, seed)
     assert (config.steps, config.device, config.max_texture_size) == (9, "cuda:1", options.max_texture_size)
     assert config.face_budget == (engine.TextureConfig().face_budget if face_budget is None else face_budget)
 

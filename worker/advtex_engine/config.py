@@ -73,9 +73,11 @@ METHODS = (
     "adversarial_no_auxiliary",
     "adversarial_no_condition",
     "best_view",
+    "colormap",
     "l1",
     "mean",
     "sharpest",
+    "vgg",
     "view_selection",
 )
 
@@ -90,7 +92,7 @@ class TextureConfig:
     steps             overrides the preset's step count, its levels scaled in proportion
     face_budget       the mesh is decimated to at most this many faces
     max_texture_size  cap on the texture's side in texels
-    refine            cameras and exposures are refined first (never for the preset "paper", which stays as published)
+    refine            cameras and exposures are refined first; never for the preset "paper", which stays as published
     """
 
     preset: str = "auto"
@@ -105,6 +107,11 @@ class TextureConfig:
     device: str = "auto"
     seed: int = 0
     checkpoint_seconds: float = 30.0
+
+    @property
+    def refines(self) -> bool:
+        """Whether cameras and exposures are refined first; the method colormap is nothing without."""
+        return self.method == "colormap" or (self.refine and self.preset != "paper")
 
     def __post_init__(self) -> None:
         if self.preset != "auto" and self.preset not in PRESETS:

@@ -24,7 +24,7 @@ from advtex_engine.errors import OptionError
 from advtex_engine.export import export_model
 from advtex_engine.geometry import clean, decimate
 from advtex_engine.ingest import ingest
-from advtex_engine.methods import METHODS, MethodInput
+from advtex_engine.methods import METHODS, MethodInput, require
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.monitor import Monitor
 from advtex_engine.refine import apply_refinement, refine_cameras, refinement_from_dict, refinement_to_dict
@@ -58,10 +58,12 @@ def texture_scan(
     """Textures a scan: model.obj, model.mtl, model.png, model.glb, report.json and previews/ below `out`.
 
     work: folder for stage caches and checkpoints. With `resume`, what it holds of the same scan and options is used;
-    without, it is cleared. Raises ScanError, OptionError, and Stopped once the monitor asks for a stop.
+    without, it is cleared. Raises ScanError, OptionError, WeightsError for a method without its weights, and Stopped
+    once the monitor asks for a stop.
     """
     device = choose_device(config.device)
     preset = resolve_preset(config, device)
+    require(config.method)
     monitor = WarningKeeper(monitor or Monitor())
     folder = WorkFolder(work, fingerprint(scan, config), monitor)
     if not resume:
@@ -157,7 +159,7 @@ def _refine(
 
     What was found is small and cached by itself: the scene as it came stays in its own cache.
     """
-    if not config.refine or config.preset == "paper":
+    if not config.refines:
         return scene, None
     saved = folder.load("refinement")
     if saved is not None:

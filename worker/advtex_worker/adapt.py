@@ -13,6 +13,7 @@ def texture_config(options: JobOptions, device: str) -> TextureConfig:
     size = (options.width, options.height) if options.width and options.height else None
     config = TextureConfig(
         preset=options.preset.value,
+        method=options.method.value,
         size=size,
         holdout=options.holdout,
         steps=options.steps,

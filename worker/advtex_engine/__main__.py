@@ -16,12 +16,25 @@ from advtex_engine.errors import EngineError, OptionError, Problem, Stopped
 from advtex_engine.monitor import Monitor
 
 
-class _Terminal(Monitor):
-    """Prints stages and progress to stderr; the first SIGINT or SIGTERM asks for a stop with a checkpoint."""
+class _Printer(Monitor):
+    """Prints warnings to stderr, each line with the seconds since the start."""
 
     def __init__(self) -> None:
-        self.stop = False
         self.started = time.monotonic()
+
+    def warning(self, problem: Problem) -> None:
+        self._say(f"warning: {problem.where}: {problem.message} ({problem.remedy})")
+
+    def _say(self, words: str) -> None:
+        print(f"[{time.monotonic() - self.started:7.1f} s] {words}", file=sys.stderr, flush=True)
+
+
+class _Terminal(_Printer):
+    """Prints stages and progress too; the first SIGINT or SIGTERM asks for a stop with a checkpoint."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stop = False
         self.first: tuple[int, float] | None = None
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._ask)
@@ -44,14 +57,8 @@ class _Terminal(Monitor):
         named = ", ".join(f"{name} {value:.3f}" for name, value in losses.items())
         self._say(f"step {step}/{steps}: {named}{left}")
 
-    def warning(self, problem: Problem) -> None:
-        self._say(f"warning: {problem.where}: {problem.message} ({problem.remedy})")
-
     def stop_requested(self) -> bool:
         return self.stop
-
-    def _say(self, words: str) -> None:
-        print(f"[{time.monotonic() - self.started:7.1f} s] {words}", file=sys.stderr, flush=True)
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -84,6 +91,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("scan", type=Path, help="folder or zip")
     evaluate.add_argument("--holdout", type=int, help="only the sorted frames whose position %% N == N // 2")
     evaluate.add_argument("--size", type=parse_size, help="size of renders and photographs, WIDTHxHEIGHT")
+    evaluate.add_argument("--reference", type=Path, help="mesh that decides which pixels count; default: the scan's")
     evaluate.add_argument("--lpips-weights", type=Path, help="folder; default: $ADVTEX_LPIPS_WEIGHTS, else the cache")
     evaluate.add_argument("--download-weights", action="store_true", help="fetch the weights of LPIPS if they lack")
     evaluate.add_argument("--json", type=Path, help="write the scores per view and their means")
@@ -138,8 +146,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
     if arguments.download_weights:
         download(LPIPS_SOURCES, weights_folder(arguments.lpips_weights))
-    given = {name: getattr(arguments, name) for name in ("model", "scan", "size", "holdout")}
-    evaluation = evaluate(**given, weights=arguments.lpips_weights, sheet=arguments.contact_sheet, monitor=_Terminal())
+    given = {name: getattr(arguments, name) for name in ("model", "scan", "size", "holdout", "reference")}
+    evaluation = evaluate(**given, weights=arguments.lpips_weights, sheet=arguments.contact_sheet, monitor=_Printer())
     if arguments.json is not None:
         write_json(arguments.json, evaluation, given)
     for name, value in evaluation.mean.items():

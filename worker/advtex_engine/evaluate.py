@@ -23,7 +23,7 @@ from advtex_engine.export import TO_Y_UP
 from advtex_engine.files import write_atomically
 from advtex_engine.ingest import load_scene
 from advtex_engine.metrics import METRICS, nearest_patch_loss
-from advtex_engine.models import load_model
+from advtex_engine.models import load_model, load_reference
 from advtex_engine.monitor import Monitor
 from advtex_engine.perceptual import Lpips, WeightsError, load_lpips
 from advtex_engine.previews import contact_sheet, evenly_spread, render_layers
@@ -64,14 +64,14 @@ class Comparison:
     """A view's photograph and what the model shows in its place.
 
     photo, image: [H,W,3] float32 sRGB in [0,1]; image equals photo outside the mask and is black where the model shows
-    nothing. mask: [H,W] bool, the pixels that count. coverage: share of them that the model covers.
+    nothing. mask: [H,W] bool, the pixels that count; covered: those of them where the model is.
     """
 
     name: str
     photo: Tensor
     image: Tensor
     mask: Tensor
-    coverage: float
+    covered: Tensor
 
 
 @dataclass(frozen=True)
@@ -89,17 +89,20 @@ def evaluate(
     *,
     size: tuple[int, int] | None = None,
     holdout: int | None = None,
+    reference: Path | None = None,
     weights: Path | None = None,
     sheet: Path | None = None,
     monitor: Monitor | None = None,
 ) -> Evaluation:
     """Scores an OBJ or GLB against a scan's held-out frames, or against all frames without `holdout`.
 
-    size: width and height of the renders and photographs in pixels; None keeps the scan's. weights: see
-    `perceptual.weights_folder`; without them `lpips` and `lpips_full` are None. sheet: PNG to write, photograph |
+    size: width and height of the renders and photographs in pixels; None keeps the scan's. reference: a mesh file that
+    decides which pixels count, by default the scan's mesh; models compared with each other need the same one. weights:
+    see `perceptual.weights_folder`; without them `lpips` and `lpips_full` are None. sheet: PNG to write, photograph |
     render | difference. Raises ScanError, ModelError, OptionError, and EngineError when no view can be scored.
     """
     scene = _load_views(scan, TextureConfig(size=size, holdout=holdout), monitor or Monitor())
+    target = scene.mesh if reference is None else load_reference(reference)
     atlas, texture = load_model(model)
     if model.suffix.lower() == ".glb":
         atlas = replace(atlas, mesh=_from_y_up(atlas.mesh, scene.up_axis))
@@ -107,7 +110,7 @@ def evaluate(
     shown = {view.name for view in evenly_spread(scene.views, SHEET_VIEWS)} if sheet is not None else set()
     rows, pictures = list[dict[str, Any]](), list[tuple[View, Comparison]]()
     for view in scene.views:
-        comparison = compare(atlas, texture, view, scene.mesh)
+        comparison = compare(atlas, texture, view, target)
         if comparison is None:
             continue
         rows.append({"view": view.name, **score(comparison, lpips, {**VIEW_METRICS, **PATCH_METRICS})})
@@ -141,15 +144,14 @@ def compare(atlas: Atlas, texture: Tensor, view: View, reference: Mesh | None = 
     mask = target.face_index >= 0
     if view.depth is not None:
         mask = mask & (view.depth > 0) & ((view.depth - target.depth).abs() < DEPTH_AGREEMENT)
-    counted = int(mask.sum())
-    if counted < MIN_PIXELS:
+    if int(mask.sum()) < MIN_PIXELS:
         return None
-    there = mask & (fragments.face_index >= 0) & ((fragments.depth - target.depth).abs() < DEPTH_AGREEMENT)
+    covered = mask & (fragments.face_index >= 0) & ((fragments.depth - target.depth).abs() < DEPTH_AGREEMENT)
     color, cover = render_layers(atlas, texture, view.camera, supersample=_supersample(atlas, fragments))
     color = color / cover.clamp(min=1e-6)[..., None]
     photo = view.color.to(torch.float32) / 255
-    image = torch.where(mask[..., None], color * there[..., None], photo)
-    return Comparison(view.name, photo, image, mask, int(there.sum()) / counted)
+    image = torch.where(mask[..., None], color * covered[..., None], photo)
+    return Comparison(view.name, photo, image, mask, covered)
 
 
 def score(comparison: Comparison, lpips: Lpips | None, metrics: dict[str, Metric]) -> Scores:
@@ -158,12 +160,11 @@ def score(comparison: Comparison, lpips: Lpips | None, metrics: dict[str, Metric
     scores: Scores = {"lpips": None, "lpips_full": None}
     if lpips is not None:
         scores = {"lpips": lpips.masked(image, photo, mask), "lpips_full": lpips.on_black(image, photo, mask)}
-    for name, metric in metrics.items():
-        value = metric(image, photo, mask)
-        scores[name] = None if math.isnan(value) else value
-    scores["coverage"] = comparison.coverage
+    scores |= {name: metric(image, photo, mask) for name, metric in metrics.items()}
+    scores["flat_energy"] = flat_energy(image, photo, comparison.covered)
+    scores["coverage"] = float(comparison.covered.sum() / mask.sum())
     scores["mask_share"] = float(mask.to(torch.float32).mean())
-    return scores
+    return {name: None if value is None or math.isnan(value) else value for name, value in scores.items()}
 
 
 def mean_scores(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:

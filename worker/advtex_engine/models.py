@@ -1,10 +1,11 @@
-"""Textured models read back: an OBJ or GLB with one texture -> mesh, uv and texels."""
+"""Models read back: an OBJ or GLB with one texture -> mesh, uv and texels; and meshes without one."""
 
 from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,9 +16,9 @@ from torch import Tensor
 
 from advtex_engine.errors import EngineError
 from advtex_engine.gltf import BINARY_CHUNK, JSON_CHUNK, read_gltf
-from advtex_engine.meshio import read_obj
+from advtex_engine.meshio import read_obj, read_ply
 from advtex_engine.polygons import MeshFormatError, triangulate
-from advtex_engine.scene import Atlas
+from advtex_engine.scene import Atlas, Mesh
 
 Texture = TypeVar("Texture", str, int)
 
@@ -35,27 +36,43 @@ def load_model(path: Path) -> tuple[Atlas, Tensor]:
     OBJ: coordinates as they stand. GLB: the default scene, moved by its nodes, thus +Y up. Raises ModelError for a
     file that cannot be read, has no uv or not exactly one texture.
     """
-    try:
+    suffix = path.suffix.lower()
+    if suffix not in (".obj", ".glb"):
+        raise ModelError(f"{path}: only OBJ and GLB models are read; export the model as one of them")
+    with _reading(path):
         data = path.read_bytes()
-        if path.suffix.lower() == ".obj":
-            polygons, image = read_obj(data), _obj_texture(path, data)
-        elif path.suffix.lower() == ".glb":
-            polygons = read_gltf(data, path.name, lambda name: (path.parent / name).read_bytes())
-            image = _glb_texture(path, data)
-        else:
-            raise ModelError(f"{path}: only OBJ and GLB models are read; export the model as one of them")
-        mesh = triangulate(polygons)
-    except OSError as error:
-        raise ModelError(
-            f"{error.filename}: cannot be read ({error.strerror}); keep the model's files together"
-        ) from error
-    except MeshFormatError as error:
-        raise ModelError(f"{path}: the mesh {error}; export it again in triangles and without compression") from error
+        mesh = _mesh(path, data)
+        image = _obj_texture(path, data) if suffix == ".obj" else _glb_texture(path, data)
     if mesh.v_uv is None:
         raise ModelError(f"{path}: not every face has texture coordinates; unwrap the model first")
     if float(mesh.v_uv.min()) < -UV_SLACK or float(mesh.v_uv.max()) > 1 + UV_SLACK:
         raise ModelError(f"{path}: the texture repeats (uv outside of [0, 1]); bake the model into one atlas first")
     return Atlas(mesh, image.shape[1], image.shape[0], "scan", 0), image
+
+
+def load_reference(path: Path) -> Mesh:
+    """The mesh of a PLY, OBJ or GLB file as it lies in the file. Raises ModelError when it cannot be read."""
+    if path.suffix.lower() not in (".ply", ".obj", ".glb"):
+        raise ModelError(f"{path}: only PLY, OBJ and GLB meshes are read; export the mesh as one of them")
+    with _reading(path):
+        return _mesh(path, path.read_bytes())
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise ModelError(f"{error.filename or path}: cannot be read ({error.strerror or error})") from error
+    except MeshFormatError as error:
+        raise ModelError(f"{path}: the mesh {error}; export it again in triangles and without compression") from error
+
+
+def _mesh(path: Path, data: bytes) -> Mesh:
+    suffix = path.suffix.lower()
+    if suffix == ".glb":
+        return triangulate(read_gltf(data, path.name, lambda name: (path.parent / name).read_bytes()))
+    return triangulate(read_ply(data) if suffix == ".ply" else read_obj(data))
 
 
 def _obj_texture(path: Path, data: bytes) -> Tensor:

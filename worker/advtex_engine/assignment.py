@@ -18,7 +18,7 @@ from advtex_engine.candidates import NO_VIEW, Candidates
 SEAM_COST = 0.5  # of any seam, in units of the data term
 COLOR_COST = 0.1  # difference in color, of 1, that costs as much as SEAM_COST once more
 MAX_COLOR_COST = 3.0
-MESSAGE_ROUNDS = 40
+MESSAGE_ROUNDS = 20
 DAMPING = 0.5
 DESCENT_ROUNDS = 200
 
@@ -42,6 +42,13 @@ def face_adjacency(t_pos_idx: Tensor) -> Adjacency:
     return Adjacency(pair // 3, pair % 3)
 
 
+def edge_ends(t_pos_idx: Tensor, adjacency: Adjacency, number: int) -> Tensor:
+    """[E,2] corner numbers of the edges' ends in the first or second face, that of the lower vertex index first."""
+    face, side = adjacency.face[:, number], adjacency.side[:, number]
+    ends = torch.stack((side, (side + 1) % 3), 1)
+    return ends.gather(1, t_pos_idx[face].gather(1, ends).argsort(1))
+
+
 def seam_costs(t_pos_idx: Tensor, candidates: Candidates, adjacency: Adjacency) -> Tensor:
     """[E,K,K] cost of showing candidate a of the first and candidate b of the second face beside each other."""
     first, second = (_along_edge(t_pos_idx, candidates, adjacency, number) for number in (0, 1))
@@ -53,11 +60,8 @@ def seam_costs(t_pos_idx: Tensor, candidates: Candidates, adjacency: Adjacency) 
 
 def _along_edge(t_pos_idx: Tensor, candidates: Candidates, adjacency: Adjacency, number: int) -> Tensor:
     """[E,K,9] colors in [0,1] at the edges' ends and midpoints, the end of the lower vertex index first."""
-    face, side = adjacency.face[:, number], adjacency.side[:, number]
-    ends = torch.stack((side, (side + 1) % 3), 1)
-    ends = ends.gather(1, t_pos_idx[face].gather(1, ends).argsort(1))
-    places = torch.cat((ends, side[:, None] + 3), 1)
-    colors = candidates.color[face[:, None], :, places]
+    places = torch.cat((edge_ends(t_pos_idx, adjacency, number), adjacency.side[:, number, None] + 3), 1)
+    colors = candidates.color[adjacency.face[:, number, None], :, places]
     return colors.transpose(1, 2).flatten(2).to(torch.float32) / 255
 
 
@@ -119,10 +123,10 @@ def descend(choice: Tensor, unary: Tensor, pairs: Tensor, pairwise: Tensor) -> T
 
 @dataclass(frozen=True)
 class Assignment:
-    """view: [T] int64, -1 where no view sees the face. margin: [T] data term of the best other view minus its own."""
+    """view: [T] int64, -1 where no view sees the face. agreement: [T] in [0,1] of its color with the other views'."""
 
     view: Tensor
-    margin: Tensor
+    agreement: Tensor
 
 
 def assign_views(t_pos_idx: Tensor, candidates: Candidates) -> Assignment:
@@ -132,9 +136,9 @@ def assign_views(t_pos_idx: Tensor, candidates: Candidates) -> Assignment:
     both = seen[adjacency.face].all(1)
     adjacency = Adjacency(adjacency.face[both], adjacency.side[both])
     pairwise = seam_costs(t_pos_idx, candidates, adjacency)
+    cost = candidates.cost + candidates.disagreement
     # Costs are relative to the face's best: what all views of a face share decides nothing.
-    unary = (candidates.cost - candidates.cost.amin(1, keepdim=True)).clamp(max=NO_VIEW)
+    unary = (cost - cost.amin(1, keepdim=True)).clamp(max=NO_VIEW)
     choice = solve(unary, adjacency.face, pairwise)[:, None]
-    own = candidates.cost.gather(1, choice)[:, 0]
-    others = candidates.cost.scatter(1, choice, NO_VIEW).amin(1)
-    return Assignment(candidates.view.gather(1, choice)[:, 0], others - own)
+    agreement = torch.exp(-candidates.disagreement.gather(1, choice)[:, 0])
+    return Assignment(candidates.view.gather(1, choice)[:, 0], agreement)

@@ -11,7 +11,7 @@ discontinuities and from the image's border, and agreement in color with the fac
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -34,7 +34,7 @@ DEPTH_JUMP = 0.03
 GRAZING_WEIGHT = 0.5
 EDGE_WEIGHT = 1.0
 SHARPNESS_WEIGHT = 1.0
-AGREEMENT_WEIGHT = 1.0
+AGREEMENT_WEIGHT = 0.5
 AGREEMENT_ROUNDS = 4
 AGREEMENT_SCALE = 0.05  # least deviation in color, of 1, that counts as disagreement
 MAX_DISAGREEMENT = 3.0
@@ -55,12 +55,14 @@ class FacePoints:
 class Candidates:
     """The best K views of each of T faces, in no order.
 
-    view: [T,K] int64, -1 = none. cost: [T,K] float32, the data term; NO_VIEW where none.
+    view: [T,K] int64, -1 = none. cost: [T,K] float32, the data term without agreement; NO_VIEW where none.
+    disagreement: [T,K] float32, the data term's part for agreement with the other views.
     color: [T,K,7,3] uint8, what the view shows at the face's places.
     """
 
     view: Tensor
     cost: Tensor
+    disagreement: Tensor
     color: Tensor
 
 
@@ -88,29 +90,36 @@ def find_candidates(mesh: Mesh, maps: ViewMaps, tolerance: float) -> Candidates:
     kept = Candidates(
         torch.full((faces, KEPT_VIEWS), -1, device=device),
         torch.full((faces, KEPT_VIEWS), NO_VIEW, device=device),
+        torch.zeros((faces, KEPT_VIEWS), device=device),
         torch.zeros((faces, KEPT_VIEWS, POINTS, 3), dtype=torch.uint8, device=device),
     )
     blur = frame_blur(maps)
     for view in range(maps.count):
         _look(view, points, normal, maps, float(blur[view]), tolerance * OCCLUSION_SHARE, kept)
-    return Candidates(kept.view, kept.cost + disagreement(kept.color, kept.view >= 0), kept.color)
+    return replace(kept, disagreement=disagreement(kept.color, kept.view >= 0))
 
 
 def _look(
     view: int, points: FacePoints, normal: Tensor, maps: ViewMaps, blur: float, tolerance: float, kept: Candidates
 ) -> None:
     """Puts a view into the places of worse ones, for the faces that it sees whole."""
-    pixel, depth, ray = _project(points.position, maps, view)
-    safety = edge_distance(maps.depth[view].view(maps.height, maps.width).to(torch.float32)) / SAFE_DISTANCE
-    safe, color = _sample(pixel, depth, safety, maps, view, tolerance)
-    seen = safe[points.index].amin(1)
-    face = (seen > 0).nonzero()[:, 0]
+    pixel, depth = _project(points.position, maps, view)
+    inside = (depth > MIN_DEPTH) & (pixel > 0.5).all(1)
+    inside &= (pixel[:, 0] < maps.width - 0.5) & (pixel[:, 1] < maps.height - 0.5)
+    face = inside[points.index[:, :3]].all(1).nonzero()[:, 0]
     index = points.index[face]
+    needed = torch.zeros_like(inside)
+    needed[index] = True
+    safe, color = _sample(pixel, depth, needed.nonzero()[:, 0], maps, view, tolerance)
+    seen = safe[index].amin(1)
+    face, index, seen = face[seen > 0], index[seen > 0], seen[seen > 0]
     a, b, c = pixel[index[:, :3]].unbind(1)
     area = ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]).abs() / 2
-    cosine = (normal[face] * ray[index[:, 6]]).sum(1).abs()
+    center = -maps.world_to_camera[view, :3, :3].T @ maps.world_to_camera[view, :3, 3]
+    ray = F.normalize(points.position[index[:, 6]] - center.to(points.position), dim=1)
+    cosine = (normal[face] * ray).sum(1).abs()
     cost = -0.5 * area.clamp(min=1e-6).log() - GRAZING_WEIGHT * cosine.clamp(min=1e-3).log()
-    cost += EDGE_WEIGHT * (1 - seen[face]) + SHARPNESS_WEIGHT * blur
+    cost += EDGE_WEIGHT * (1 - seen) + SHARPNESS_WEIGHT * blur
     worst, place = kept.cost[face].max(1)
     better = cost < worst
     face, place = face[better], place[better]
@@ -119,29 +128,26 @@ def _look(
     kept.color[face, place] = color[index[better]]
 
 
-def _project(position: Tensor, maps: ViewMaps, view: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels [P,2], depth [P] and unit viewing rays [P,3] (world) of world points."""
-    pose = maps.world_to_camera[view]
-    center = (-pose[:3, :3].T @ pose[:3, 3]).to(position)
-    from_center = position - center
-    seen = from_center @ pose[:3, :3].T.to(position)
-    focal, principal = maps.intrinsics[view, :2], maps.intrinsics[view, 2:]
+def _project(position: Tensor, maps: ViewMaps, view: int) -> tuple[Tensor, Tensor]:
+    """Pixels [P,2] and depth [P] of world points."""
+    pose = maps.world_to_camera[view].to(position)
+    seen = position @ pose[:3, :3].T + pose[:3, 3]
     depth = seen[:, 2]
-    pixel = seen[:, :2] / torch.where(depth > MIN_DEPTH, depth, 1.0)[:, None] * focal + principal
-    return pixel, depth, F.normalize(from_center, dim=1)
+    on_plane = seen[:, :2] / torch.where(depth > MIN_DEPTH, depth, 1.0)[:, None]
+    return on_plane * maps.intrinsics[view, :2] + maps.intrinsics[view, 2:], depth
 
 
 def _sample(
-    pixel: Tensor, depth: Tensor, safety: Tensor, maps: ViewMaps, view: int, tolerance: float
+    pixel: Tensor, depth: Tensor, which: Tensor, maps: ViewMaps, view: int, tolerance: float
 ) -> tuple[Tensor, Tensor]:
-    """Safety [P] in [0,1], 0 where the view does not see the point, and its color [P,3] uint8."""
-    inside = (depth > MIN_DEPTH) & (pixel > 0.5).all(1) & (pixel[:, 0] < maps.width - 0.5)
-    which = (inside & (pixel[:, 1] < maps.height - 0.5)).nonzero()[:, 0]
+    """Safety [P] in [0,1], 0 where the view does not see the point, and its color [P,3] uint8; of points `which`."""
     indices, weights = bilinear_footprint(pixel[which], maps.width, maps.height)
-    surface = maps.depth[view].to(torch.float32)[indices]
-    # The farthest of four pixels decides, or else every point beside an occluding edge would count as hidden.
+    view_depth = maps.depth[view].to(torch.float32)
+    surface = view_depth[indices]
+    # The best of four pixels decides, or else every point beside an occluding edge would count as hidden.
     apart = torch.where(surface > 0, (surface - depth[which, None]).abs(), torch.inf).amin(1)
-    reliable = (safety.flatten()[indices] * weights).sum(1).clamp(min=1e-3)
+    safety = edge_distance(view_depth.view(maps.height, maps.width)).flatten() / SAFE_DISTANCE
+    reliable = (safety[indices] * weights).sum(1).clamp(min=1e-3)
     safe = torch.zeros_like(depth)
     safe[which] = torch.where(apart < tolerance, reliable, 0.0)
     color = torch.zeros((len(pixel), 3), dtype=torch.uint8, device=pixel.device)
@@ -152,15 +158,30 @@ def _sample(
 
 def edge_distance(depth: Tensor) -> Tensor:
     """[H,W] pixels (chessboard) to the nearest border, hole or discontinuity of a depth map, at most SAFE_DISTANCE."""
-    solid = torch.where(depth > 0, depth, torch.inf)[None]
-    near, far = -F.max_pool2d(-solid, 3, 1, 1), F.max_pool2d(depth[None], 3, 1, 1)
-    edge = ((depth[None] == 0) | (far > near * (1 + DEPTH_JUMP))).to(torch.float32)
-    edge = F.pad(edge, (1, 1, 1, 1), value=1.0)
-    distance = torch.zeros_like(edge)
+    edge = F.pad(depth == 0, (1, 1, 1, 1), value=True)
+    for axis in (0, 1):
+        before, after = depth.narrow(axis, 0, depth.shape[axis] - 1), depth.narrow(axis, 1, depth.shape[axis] - 1)
+        nearer = torch.minimum(before, after)
+        jump = (nearer > 0) & ((before - after).abs() > DEPTH_JUMP * nearer)
+        inner = edge[1:-1, 1:-1]
+        inner.narrow(axis, 0, depth.shape[axis] - 1).logical_or_(jump)
+        inner.narrow(axis, 1, depth.shape[axis] - 1).logical_or_(jump)
+    distance = torch.zeros(edge.shape, device=depth.device)
     for _ in range(SAFE_DISTANCE):
-        distance += 1 - edge
-        edge = F.max_pool2d(edge, 3, 1, 1)
-    return distance[0, 1:-1, 1:-1]
+        distance += ~edge
+        edge = _dilated(edge)
+    return distance[1:-1, 1:-1]
+
+
+def _dilated(mask: Tensor) -> Tensor:
+    """[H,W] bool, grown by one pixel in all eight directions."""
+    rows = mask.clone()
+    rows[1:] |= mask[:-1]
+    rows[:-1] |= mask[1:]
+    both = rows.clone()
+    both[:, 1:] |= rows[:, :-1]
+    both[:, :-1] |= rows[:, 1:]
+    return both
 
 
 def luminance(color: Tensor) -> Tensor:
@@ -188,12 +209,13 @@ def _gradient(gray: Tensor) -> Tensor:
 
 
 def disagreement(color: Tensor, valid: Tensor) -> Tensor:
-    """[T,K] how far each view's colors lie from those that most views of the face show, 0 to MAX_DISAGREEMENT.
+    """[T,K] how far each view's mean color lies from what most views of the face show, 0 to MAX_DISAGREEMENT.
 
-    color: [T,K,7,3] uint8; valid: [T,K] bool. The consensus is a mean with weights exp(-d^2 / 2 s^2) found by
-    repetition, s the root mean square deviation so far but at least AGREEMENT_SCALE.
+    color: [T,K,7,3] uint8; valid: [T,K] bool. Means over a face, because the places themselves agree best in views
+    that lack detail, such as thin lines that the others show in different places. The consensus is a mean with weights
+    exp(-d^2 / 2 s^2) found by repetition, s the root mean square deviation so far but at least AGREEMENT_SCALE.
     """
-    values = color.to(torch.float32).flatten(2) / 255
+    values = color.to(torch.float32).mean(2) / 255
     weight = valid.to(torch.float32)
     for _ in range(AGREEMENT_ROUNDS):
         total = weight.sum(1, keepdim=True).clamp(min=1e-6)

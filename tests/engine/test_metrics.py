@@ -141,6 +141,23 @@ def test_nearest_patch_loss_forgives_shifts_and_not_blur() -> None:
     assert nearest_patch_loss(flat + 0.1, flat) == pytest.approx(25.5, rel=1e-4)
 
 
+def test_nearest_patches_are_sought_within_the_mask() -> None:
+    image, truth = noise(40, 48, 1), noise(40, 48, 2)
+    mask = half(image)
+    assert nearest_patch_loss(image, truth, mask) == pytest.approx(nearest_patch_loss(image[:, :24], truth[:, :24]))
+    assert nearest_patch_loss(image, truth, everywhere(image)) == pytest.approx(nearest_patch_loss(image, truth))
+    assert math.isnan(nearest_patch_loss(image, truth, ~everywhere(image)))
+
+
+def test_a_few_queries_estimate_the_nearest_patch_loss() -> None:
+    image, truth = noise(60, 64, 1), blurred(noise(60, 64, 2))
+    whole = nearest_patch_loss(image, truth)
+    estimates = [nearest_patch_loss(image, truth, queries=300, seed=seed) for seed in (0, 0, 1)]
+    assert estimates[0] == estimates[1] != estimates[2]
+    assert estimates == pytest.approx([whole] * 3, rel=0.02)
+    assert nearest_patch_loss(image, truth, queries=10**6) == pytest.approx(whole)
+
+
 def test_sliced_wasserstein_of_constant_images() -> None:
     flat = torch.full((20, 20, 3), 0.3)
     # Along a unit vector d the shift is 25.5 times the sum of d, whose mean magnitude is sqrt(2 / pi).
@@ -165,6 +182,14 @@ def test_sliced_wasserstein_is_its_definition() -> None:
     ordered = [np.sort(directions @ patches(picture).T, axis=1) for picture in (image, truth)]
     expected = float(np.abs(ordered[0] - ordered[1]).mean())
     assert sliced_wasserstein(image, truth) == pytest.approx(expected, rel=0.1)
+
+
+def test_sliced_wasserstein_of_some_patches_estimates_that_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    image, truth = blurred(noise(80, 90, 1)), noise(80, 90, 2)
+    whole = sliced_wasserstein(image, truth)
+    monkeypatch.setattr(metrics, "MAX_PATCHES", 2000)
+    assert sliced_wasserstein(image, truth) == pytest.approx(whole, rel=0.03)
+    assert sliced_wasserstein(truth, truth) == 0
 
 
 def test_sliced_wasserstein_without_a_whole_patch_is_nan() -> None:

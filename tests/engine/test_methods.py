@@ -18,7 +18,7 @@ from advtex_engine.config import METHODS as METHOD_NAMES
 from advtex_engine.config import PRESETS, PyramidLevel, TextureConfig
 from advtex_engine.discriminator import PatchDiscriminator
 from advtex_engine.errors import Stopped
-from advtex_engine.methods import METHODS, MethodInput
+from advtex_engine.methods import METHODS, MethodInput, descent
 from advtex_engine.methods.best_view import label_faces
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.sharpest import sharpness
@@ -189,7 +189,7 @@ def flat_task(work: Path, monitor: Monitor | None = None, **config: object) -> t
 
 
 def test_l1_is_the_median_where_every_pixel_is_one_texel(tmp_path: Path) -> None:
-    given, color = flat_task(tmp_path, steps=1000)
+    given, color = flat_task(tmp_path, steps=3000)
     texture, losses = METHODS["l1"](given)
     median = color.float().median(0).values / 255
     # The codes of texture coordinates are 1/65535 apart, so the pixels are not exactly the texels.
@@ -298,15 +298,17 @@ def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_vgg_comes_nearer_in_features_and_in_colors(around: MethodInput, weights: Path) -> None:
+@pytest.mark.usefixtures("weights")
+def test_vgg_comes_nearer_in_features_and_in_colors(around: MethodInput, monkeypatch: pytest.MonkeyPatch) -> None:
     """From a gray start, since without errors the mean is the answer already."""
+    monkeypatch.setattr(descent, "LR", 1e-2)
     gray = torch.full_like(around.means[1], 0.5)
-    preset = replace(around.preset, levels=(PyramidLevel(25),))
+    preset = replace(around.preset, levels=(PyramidLevel(15),))
     texture, losses = METHODS["vgg"](replace(around, means={1: gray}, preset=preset))
     assert losses[-1]["vgg"] < 0.9 * losses[0]["vgg"]
     seen = around.maps[1].slot_map >= 0
     before, after = ((start - truth())[seen].abs().mean() for start in (gray, texture))
-    assert after < 0.97 * before
+    assert after < 0.9 * before
 
 
 def test_the_truncated_network_gives_the_first_features_of_the_whole(weights: Path) -> None:

@@ -270,12 +270,23 @@ def test_folders_with_something_else_are_left_alone(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("wrong", "words"),
-    [({"views": 2}, "too few"), ({"width": 8}, "too small"), ({"camera_error": -1.0}, "must not be negative")],
+    [({"views": 2}, "too few"), ({"width": 8}, "too small"), ({"camera_turn": -1.0}, "must not be negative")],
 )
 def test_numbers_out_of_bounds_are_named(tmp_path: Path, wrong: dict[str, Any], words: str) -> None:
     with pytest.raises(OptionError, match=words):
         synthesize(tmp_path / "scan", **wrong)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_camera_is_turned_and_moved_by_separate_errors() -> None:
+    rng = np.random.default_rng(0)
+    turned = module._misplaced(np.eye(4), module.Errors(0.0, 0.1, 0.0), rng)
+    assert np.array_equal(turned[:3, 3], np.zeros(3))
+    angle = np.arccos((np.trace(turned[:3, :3]) - 1) / 2)
+    assert 0 < angle <= 0.1 * np.sqrt(3) + 1e-3
+    moved = module._misplaced(np.eye(4), module.Errors(0.1, 0.0, 0.0), rng)
+    assert np.array_equal(moved[:3, :3], np.eye(3))
+    assert 0 < np.abs(moved[:3, 3]).max() <= 0.1
 
 
 def test_an_interrupted_synthesis_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

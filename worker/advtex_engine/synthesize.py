@@ -77,6 +77,15 @@ class Shot:
     camera: Camera
 
 
+@dataclass(frozen=True)
+class Errors:
+    """What real scans have: e_t in metres, e_a in radians, e_g in metres (see the module's docstring)."""
+
+    camera: float
+    turn: float
+    geometry: float
+
+
 def synthesize(
     out: Path,
     *,
@@ -85,24 +94,26 @@ def synthesize(
     height: int = 240,
     seed: int = 0,
     camera_error: float = CAMERA_ERROR,
+    camera_turn: float | None = None,
     geometry_error: float = GEOMETRY_ERROR,
 ) -> None:
     """Write a synthetic scan: a zip when `out` ends in .zip, else a folder, which is replaced if it is one of these.
 
-    views: frames of width x height pixels. camera_error: e_t in metres; e_a is the angle that moves the image as far
-    (e_t / DISTANCE). geometry_error: e_g in metres. The same arguments make the same scan. Raises OptionError for
-    numbers out of bounds and for a folder that holds something else.
+    views: frames of width x height pixels. camera_error: e_t in metres. camera_turn: e_a in radians, by default the
+    angle that moves the image as far (e_t / DISTANCE). geometry_error: e_g in metres. The same arguments make the same
+    scan. Raises OptionError for numbers out of bounds and for a folder that holds something else.
     """
     if views < MIN_VIEWS or min(width, height) < MIN_SIDE:
         raise OptionError(f"{views} views of {width}x{height} are too few or too small; at least 3 of 16x16 are needed")
-    if camera_error < 0 or geometry_error < 0:
-        raise OptionError(f"errors are lengths: {camera_error} and {geometry_error} must not be negative")
+    errors = Errors(camera_error, camera_error / DISTANCE if camera_turn is None else camera_turn, geometry_error)
+    if min(errors.camera, errors.turn, errors.geometry) < 0:
+        raise OptionError(f"errors are sizes and must not be negative: {errors}")
     if out.is_dir() and any(out.iterdir()) and not (out / TRUTH).is_file():
         raise OptionError(f"{out} holds something else than a synthetic scan; choose another folder or remove it")
     out.resolve().parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".advtex-synthesize-", dir=out.resolve().parent) as work:
         folder = Path(work) / "scan"
-        _write_scan(folder, views, width, height, seed, camera_error, geometry_error)
+        _write_scan(folder, views, width, height, seed, errors)
         if out.suffix == ".zip":
             _zip_folder(folder, Path(work) / "scan.zip")
             (Path(work) / "scan.zip").replace(out)
@@ -168,9 +179,7 @@ def _member(scan: Path, name: str) -> bytes:
         return archive.read(name)
 
 
-def _write_scan(
-    folder: Path, views: int, width: int, height: int, seed: int, camera_error: float, geometry_error: float
-) -> None:
+def _write_scan(folder: Path, views: int, width: int, height: int, seed: int, errors: Errors) -> None:
     rng = np.random.default_rng(seed)
     for name in ("color", "depth", "truth/heldout"):
         (folder / name).mkdir(parents=True)
@@ -193,7 +202,7 @@ def _write_scan(
         atlas, texture = synthetic_object.build(seed)
         list(pool.map(capture, range(views)))
         list(pool.map(keep, heldout))
-    _write_ply(folder / "mesh.ply", _bent(atlas.mesh, geometry_error, rng))
+    _write_ply(folder / "mesh.ply", _bent(atlas.mesh, errors.geometry, rng))
     scan = {
         "version": 1,
         "kind": "object",
@@ -204,7 +213,7 @@ def _write_scan(
         "mesh": "mesh.ply",
         "frames": [
             {"color": f"color/{shot.name}.png", "depth": f"depth/{shot.name}.png"}
-            | _pose(shot.name, _misplaced(camera_to_world(shot.camera).numpy(), camera_error, rng))
+            | _pose(shot.name, _misplaced(camera_to_world(shot.camera).numpy(), errors, rng))
             for shot in shots
         ],
     }
@@ -267,10 +276,10 @@ def _measured(depth: NDArray[np.float32], rng: np.random.Generator) -> NDArray[n
     return np.where(depth > 0, np.rint(noisy * DEPTH_SCALE), 0).astype(np.uint16)
 
 
-def _misplaced(camera_to_world: NDArray[np.float64], error: float, rng: np.random.Generator) -> NDArray[np.float64]:
+def _misplaced(camera_to_world: NDArray[np.float64], errors: Errors, rng: np.random.Generator) -> NDArray[np.float64]:
     """The pose with the paper's camera errors, turned about the camera's own centre."""
-    translation = rng.uniform(-error, error, 3)
-    x, y, z = rng.uniform(-1, 1, 3) * error / DISTANCE
+    translation = rng.uniform(-errors.camera, errors.camera, 3)
+    x, y, z = rng.uniform(-1, 1, 3) * errors.turn
     turn = _axis_turn(2, z) @ _axis_turn(1, y) @ _axis_turn(0, x)
     moved = camera_to_world.copy()
     moved[:3, :3] = moved[:3, :3] @ turn

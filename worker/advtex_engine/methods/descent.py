@@ -13,7 +13,7 @@ from advtex_engine.errors import Stopped
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.methods.mean import dense_texture
 
-LR = 2e-3
+LR = 1e-3
 """Learning rate of the first step, in colors of [0, 1]; it falls to zero in a straight line, so that the last steps
 settle and do not shake."""
 HISTORY_POINTS = 200  # loss means kept for the report and shown as progress

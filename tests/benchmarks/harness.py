@@ -1,0 +1,250 @@
+"""What the benchmarks share: scans with known truth through the engine's stages, scores, results that survive a stop.
+
+A benchmark fills a `Results` file cell by cell. Run again with the same arguments it goes on where it was stopped; run
+with others, it adds to the file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import datetime
+import json
+import shlex
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from advtex_engine.atlas import build_atlas
+from advtex_engine.checkpoint import WorkFolder
+from advtex_engine.config import TextureConfig
+from advtex_engine.evaluate import PATCH_METRICS, VIEW_METRICS, Comparison, score
+from advtex_engine.files import write_atomically
+from advtex_engine.geometry import clean, decimate
+from advtex_engine.ingest import ingest
+from advtex_engine.methods import METHODS, MethodInput
+from advtex_engine.methods.mean import mean_texture
+from advtex_engine.models import load_model
+from advtex_engine.monitor import Monitor
+from advtex_engine.perceptual import Lpips, WeightsError, load_lpips
+from advtex_engine.pipeline import resolve_preset
+from advtex_engine.previews import render_layers
+from advtex_engine.refine import apply_refinement, refine_cameras
+from advtex_engine.scene import Atlas, Camera, Mesh
+from advtex_engine.synthesize import SUPERSAMPLE, TRUTH
+from advtex_engine.texture import fill_holes
+from advtex_engine.views import build_view_maps
+
+RESULTS = Path(__file__).parent / "results"
+SCORES = {
+    "lpips": "LPIPS",
+    "nearest_patch": "nearest patch",
+    "nearest_patch_reverse": "nearest patch, truth to texture",
+    "s3_difference": "S3 difference",
+    "gradient_difference": "gradient difference",
+    "gradient_ratio": "gradient ratio",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Truth:
+    """The true object from the held-out cameras of a synthesized scan: images [H,W,3] in [0,1], where it is [H,W]."""
+
+    cameras: list[Camera]
+    images: list[Tensor]
+    covers: list[Tensor]
+
+
+def load_truth(scan: Path) -> Truth:
+    """scan: folder that `synthesize` wrote."""
+    told = json.loads((scan / TRUTH).read_text())
+    K = torch.tensor(told["intrinsics_matrix"], dtype=torch.float64)
+    atlas, texture = load_model(scan / "truth" / "object.obj")
+    cameras = [
+        Camera(K, torch.from_numpy(np.linalg.inv(np.array(view["camera_to_world"]))), told["width"], told["height"])
+        for view in told["heldout"]
+    ]
+    layers = [render_layers(atlas, texture, camera, supersample=SUPERSAMPLE) for camera in cameras]
+    return Truth(cameras, [color for color, _ in layers], [cover == 1 for _, cover in layers])
+
+
+def prepare(scan: Path, config: TextureConfig, work: Path, device: torch.device, every: int = 1) -> MethodInput:
+    """A scan as methods take it: every `every`-th view, cameras refined where the configuration says so."""
+    monitor = Monitor()
+    scene = ingest(scan, config, monitor)
+    scene = dataclasses.replace(
+        scene, views=scene.views[::every], mesh=decimate(clean(scene.mesh), config.face_budget, monitor)
+    )
+    if config.refines:
+        scene = apply_refinement(scene, refine_cameras(scene, device, config.seed))
+    atlas = build_atlas(scene.mesh, [view.camera for view in scene.views], config, monitor)
+    atlas = dataclasses.replace(atlas, mesh=moved(atlas.mesh, device))
+    maps = build_view_maps(atlas, scene.views, scene.kind)
+    preset = resolve_preset(config, device)
+    folder = WorkFolder(work, "", monitor)
+    return MethodInput(scene, atlas, {1: maps}, {1: mean_texture(maps)}, preset, config, monitor, folder)
+
+
+def moved(mesh: Mesh, device: torch.device) -> Mesh:
+    """A mesh with texture coordinates on another device."""
+    assert mesh.v_uv is not None
+    assert mesh.t_uv_idx is not None
+    return Mesh(*(part.to(device) for part in (mesh.v_pos, mesh.t_pos_idx, mesh.v_uv, mesh.t_uv_idx)))
+
+
+def run_method(given: MethodInput, method: str) -> Tensor:
+    """The method's texture [H,W,3] on the CPU, from the start: what an earlier method left behind is cleared."""
+    given.work.clear()
+    texture, _ = METHODS[method](dataclasses.replace(given, config=dataclasses.replace(given.config, method=method)))
+    return fill_holes(texture, given.maps[1].slot_map >= 0).cpu()
+
+
+def needed_lpips(folder: Path | None) -> Lpips:
+    """LPIPS; ends the program without its weights, since a table without LPIPS says little."""
+    try:
+        return load_lpips(folder)
+    except WeightsError as error:
+        raise SystemExit(str(error)) from error
+
+
+def score_texture(atlas: Atlas, texture: Tensor, truth: Truth, lpips: Lpips) -> dict[str, float]:
+    """Means over the held-out views, of pixels where both the model and the true object are."""
+    atlas = dataclasses.replace(atlas, mesh=moved(atlas.mesh, torch.device("cpu")))
+    rows = []
+    for camera, image, cover in zip(truth.cameras, truth.images, truth.covers, strict=True):
+        render, seen = render_layers(atlas, texture, camera, supersample=SUPERSAMPLE)
+        mask = cover & (seen == 1)
+        shown = torch.where(mask[..., None], render, image)
+        row = score(Comparison("", image, shown, mask, mask), lpips, {**VIEW_METRICS, **PATCH_METRICS})
+        for name in ("s3", "gradient"):
+            row[f"{name}_difference"] = abs(1 - float(row[f"{name}_ratio"] or 0))
+        rows.append(row)
+    return {name: sum(float(row[name] or 0) for row in rows) / len(rows) for name in SCORES}
+
+
+class Results:
+    """Cells of a benchmark in a JSON file: each its settings, its scores and how it was made."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.cells: list[dict[str, Any]] = json.loads(path.read_text())["cells"] if path.exists() else []
+
+    def find(self, settings: Mapping[str, Any]) -> dict[str, Any] | None:
+        """The cell with exactly these settings."""
+        return next((cell for cell in self.cells if cell["settings"] == settings), None)
+
+    def add(self, settings: Mapping[str, Any], scores: Mapping[str, float], seconds: float) -> None:
+        """Keeps a cell and writes the file, so that a stop loses no more than the cell in the making."""
+        day = datetime.datetime.now(datetime.UTC).date().isoformat()
+        made = {"date": day, "command": command(), "seconds": round(seconds, 1)}
+        self.cells.append({"settings": dict(settings), "scores": dict(scores), **made})
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(self.path, json.dumps({"cells": self.cells}, indent=1).encode() + b"\n")
+        shown = ", ".join(f"{name} {value:.4g}" for name, value in scores.items())
+        print(f"{' '.join(str(value) for value in settings.values())}: {shown}; {seconds:.0f} s", flush=True)
+
+
+def command() -> str:
+    """The command line as one would type it at the top of the repository."""
+    script = Path(sys.argv[0])
+    shown = Path("tests/benchmarks") / script.name if script.suffix == ".py" else script
+    return shlex.join(["python", str(shown), *sys.argv[1:]])
+
+
+def mean_of(cells: Sequence[Mapping[str, Any]], name: str) -> float:
+    """Mean of a score over cells."""
+    return sum(float(cell["scores"][name]) for cell in cells) / len(cells)
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """Numbers with three digits behind the point."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "".join(
+        "| " + " | ".join(f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in line) + " |\n"
+        for line in lines
+    )
+
+
+def write_report(path: Path, title: str, cells: Sequence[Mapping[str, Any]], body: str) -> None:
+    """A page of results that says with which commands and when it was made."""
+    days = sorted({cell["date"] for cell in cells})
+    commands = "".join(f"    {line}\n" for line in dict.fromkeys(cell["command"] for cell in cells))
+    hours = sum(cell["seconds"] for cell in cells) / 3600
+    span = days[0] if len(days) == 1 else f"{days[0]} to {days[-1]}"
+    made = f"{span}, {len(cells)} cells in {hours:.2f} hours, by\n\n{commands}"
+    write_atomically(path, f"# {title}\n\n{made}\n{body}".encode())
+
+
+@dataclasses.dataclass(frozen=True)
+class Panel:
+    """A plot: its title, the label of the x axis, and per curve its x and y values."""
+
+    title: str
+    label: str
+    curves: Mapping[str, tuple[Sequence[float], Sequence[float]]]
+
+
+def plot_grid(path: Path, panels: Sequence[Sequence[Panel]]) -> None:
+    """A PNG with rows of panels, all of the same curves."""
+    rows, columns = len(panels), len(panels[0])
+    figure = Figure(figsize=(4 * columns, 3.2 * rows), layout="tight")
+    for row, line in zip(figure.subplots(rows, columns, squeeze=False), panels, strict=True):
+        for place, panel in zip(row, line, strict=True):
+            for name, (x, y) in panel.curves.items():
+                place.plot(x, y, marker="o", markersize=3, label=name)
+            place.set_title(panel.title, fontsize=9)
+            place.set_xlabel(panel.label, fontsize=8)
+            place.tick_params(labelsize=7)
+    figure.axes[0].legend(fontsize=6)
+    figure.savefig(path, dpi=110)
+
+
+class Stopwatch:
+    """Seconds since it was made."""
+
+    def __init__(self) -> None:
+        self.started = time.monotonic()
+
+    @property
+    def seconds(self) -> float:
+        return time.monotonic() - self.started
+
+
+def common_arguments(name: str, description: str | None) -> argparse.ArgumentParser:
+    """The options of every benchmark on synthesized scans."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--views", type=int, default=60)
+    parser.add_argument("--size", default="320x240", help="WIDTHxHEIGHT of the views")
+    parser.add_argument("--steps", type=int, default=1000, help="of the methods that take steps, but for l1")
+    parser.add_argument("--preset", default="standard")
+    parser.add_argument("--faces", type=int, default=20_000)
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--refine", action="store_true", help="refine the cameras for every method")
+    parser.add_argument("--lpips-weights", type=Path, help="folder; default: $ADVTEX_LPIPS_WEIGHTS, else the cache")
+    parser.add_argument("--results", type=Path, default=RESULTS / name, help="folder of the results")
+    return parser
+
+
+def configuration(arguments: argparse.Namespace, method: str) -> TextureConfig:
+    """The common options as the engine takes them; `l1` is run until it has settled."""
+    return TextureConfig(
+        preset=arguments.preset,
+        method=method,
+        steps=None if method == "l1" else arguments.steps,
+        face_budget=arguments.faces,
+        refine=arguments.refine,
+        device=arguments.device,
+    )
+
+
+def parsed_size(text: str) -> tuple[int, int]:
+    """ "320x240" -> (320, 240)."""
+    width, height = text.split("x")
+    return int(width), int(height)

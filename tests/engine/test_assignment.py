@@ -88,7 +88,7 @@ def test_the_nearer_view_is_better_and_a_hidden_or_outlying_face_has_none() -> N
     lid, more = grid(1, side=0.2, z=0.5)
     mesh = Mesh(torch.cat((floor, lid)), torch.cat((faces, more + len(floor))))
     near, far = camera_above(0.0, 0.0, 1.0), camera_above(0.0, 0.0, 1.4)
-    candidates = find_candidates(mesh, maps_of(mesh, [far, near]), 0.03)
+    candidates = find_candidates(mesh, maps_of(mesh, [far, near]), 0.01)
     middle = mesh.v_pos[faces].mean(1)[:, :2].abs().amax(1)
     shown, hidden = (middle > 0.24), (middle < 0.1)
     assert bool((candidates.view[:128][hidden] < 0).all()), "the lid hides the floor below it"
@@ -99,7 +99,7 @@ def test_the_nearer_view_is_better_and_a_hidden_or_outlying_face_has_none() -> N
     # Twice as near shows an edge twice as long: the data term is a logarithm of lengths.
     gain = cost.sort(1).values[:, 1] - cost.sort(1).values[:, 0]
     assert 0.2 < float(gain.median()) < 0.8
-    elsewhere = find_candidates(mesh, maps_of(mesh, [near, camera_above(5.0, 0.0, 1.0)]), 0.03)
+    elsewhere = find_candidates(mesh, maps_of(mesh, [near, camera_above(5.0, 0.0, 1.0)]), 0.01)
     assert not bool((elsewhere.view == 1).any())
     assert bool((elsewhere.cost[elsewhere.view < 0] == NO_VIEW).all())
 
@@ -110,7 +110,7 @@ def test_only_the_best_views_are_kept_whatever_their_order() -> None:
     heights = torch.linspace(0.8, 2.0, KEPT_VIEWS + 6)
     order = torch.randperm(len(heights), generator=torch.Generator().manual_seed(3))
     cameras = [camera_above(0.0, 0.0, float(heights[index])) for index in order]
-    candidates = find_candidates(mesh, maps_of(mesh, cameras), 0.03)
+    candidates = find_candidates(mesh, maps_of(mesh, cameras), 0.01)
     kept = order[candidates.view].sort(1).values
     assert torch.equal(kept, torch.arange(KEPT_VIEWS).expand(len(faces), -1))
 

@@ -108,11 +108,12 @@ def test_offsets_are_the_least_squares_solution() -> None:
 def test_samples_hit_pixel_centers_and_the_low_band_keeps_ramps() -> None:
     atlas = plane()
     image = noise(1)
-    sampler = Sampler(maps_of(atlas, [image]))
+    sampler = Sampler(maps_of(atlas, [image]), 0.01)
     points = torch.tensor([[10.5 / WIDTH, 20.5 / HEIGHT, 0.0], [70.5 / WIDTH, 33.5 / HEIGHT, 0.0]])
-    grid = sampler.grid(0, points)
+    grid, depth = sampler.grid(0, points)
     expected = image[[20, 33], [10, 70]].float() / 255
     torch.testing.assert_close(full_band(sampler.image(0), grid), expected, atol=2e-4, rtol=0)
+    assert sampler.sees(0, grid, depth + torch.tensor([0.0, 0.1])).tolist() == [True, False]
     ramp = torch.linspace(0, 1, WIDTH)[None, None, None, :].expand(1, 3, HEIGHT, WIDTH)
     torch.testing.assert_close(low_band(ramp, grid), full_band(ramp, grid), atol=2e-3, rtol=0)
 
@@ -121,7 +122,7 @@ def render(atlas: Atlas, images: list[Tensor], label: Tensor) -> Tensor:
     """The texture [SIDE,SIDE,3] that `blend_texels` makes; every view sees every face."""
     texels = map_texels(atlas)
     sees = torch.arange(len(images)).expand(len(label), -1)
-    blend = blend_texels(atlas.mesh, texels, label, sees, maps_of(atlas, images), face_adjacency(atlas.mesh.t_pos_idx))
+    blend = blend_texels(atlas.mesh, texels, label, sees, Sampler(maps_of(atlas, images), 0.01))
     texture = torch.full((SIDE * SIDE, 3), torch.nan)
     texture[texels.texel] = blend.color
     return texture.view(SIDE, SIDE, 3)
@@ -160,7 +161,7 @@ def test_a_view_does_not_fade_over_faces_that_it_does_not_see() -> None:
     images = [torch.full((HEIGHT, WIDTH, 3), value, dtype=torch.uint8) for value in (20, 230)]
     texels = map_texels(atlas)
     sees = label[:, None]
-    blend = blend_texels(atlas.mesh, texels, label, sees, maps_of(atlas, images), face_adjacency(atlas.mesh.t_pos_idx))
+    blend = blend_texels(atlas.mesh, texels, label, sees, Sampler(maps_of(atlas, images), 0.01))
     torch.testing.assert_close(blend.own, torch.ones_like(blend.own))
 
 

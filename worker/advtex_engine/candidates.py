@@ -1,8 +1,9 @@
 """Which views show a face well: the data term of view selection.
 
 Each face is looked at in POINTS places, three corners, three edge midpoints and the centroid, which are shared between
-faces. A view is a candidate for a face when it sees all of them. Of the candidates the best K are kept while the views
-go by, so that memory does not grow with the number of views; then those that disagree with the others are marked down.
+faces. A view is a candidate for a face when it sees most of them, and a poor one if not all. Of the candidates the best
+K are kept while the views go by, so that memory does not grow with the number of views; then those that disagree with
+the others are marked down.
 
 The data term is a sum of logarithms, each the factor by which another view of the same face is better:
 resolution (square root of the projected area), frontality, sharpness of the frame, distance from depth
@@ -25,12 +26,14 @@ from advtex_engine.views import ViewMaps
 POINTS = 7
 KEPT_VIEWS = 16
 NO_VIEW = 1e4  # data term of an empty place
-# Of theta_z, the tolerance of reprojection between views: what is hidden by less than this counts as seen.
+# Of theta_z, the tolerance of reprojection between views: here one surface is told from another.
 OCCLUSION_SHARE = 0.3
 # Pixels from an edge of the view's surface at which a place is as good as any: poses and depth are off by some pixels.
 SAFE_DISTANCE = 8
 # Neighboring pixels whose depths differ by more than this share of the depth belong to different surfaces.
 DEPTH_JUMP = 0.03
+MIN_SHARE = 0.5  # of a face's places must be seen
+HIDDEN_WEIGHT = 6.0
 GRAZING_WEIGHT = 0.5
 EDGE_WEIGHT = 1.0
 SHARPNESS_WEIGHT = 1.0
@@ -81,7 +84,8 @@ def face_points(mesh: Mesh) -> FacePoints:
 def find_candidates(mesh: Mesh, maps: ViewMaps, tolerance: float) -> Candidates:
     """The best KEPT_VIEWS views of each face and their data terms.
 
-    tolerance: theta_z in metres. maps: at the size that the texture is sampled from. Not differentiable.
+    tolerance: metres in depth by which a place may lie behind what a view shows there. maps: at the size that the
+    texture is sampled from. Not differentiable.
     """
     points = face_points(mesh)
     faces, device = len(mesh.t_pos_idx), mesh.v_pos.device
@@ -95,14 +99,14 @@ def find_candidates(mesh: Mesh, maps: ViewMaps, tolerance: float) -> Candidates:
     )
     blur = frame_blur(maps)
     for view in range(maps.count):
-        _look(view, points, normal, maps, float(blur[view]), tolerance * OCCLUSION_SHARE, kept)
+        _look(view, points, normal, maps, float(blur[view]), tolerance, kept)
     return replace(kept, disagreement=disagreement(kept.color, kept.view >= 0))
 
 
 def _look(
     view: int, points: FacePoints, normal: Tensor, maps: ViewMaps, blur: float, tolerance: float, kept: Candidates
 ) -> None:
-    """Puts a view into the places of worse ones, for the faces that it sees whole."""
+    """Puts a view into the places of worse ones, for the faces that it sees."""
     pixel, depth = _project(points.position, maps, view)
     inside = (depth > MIN_DEPTH) & (pixel > 0.5).all(1)
     inside &= (pixel[:, 0] < maps.width - 0.5) & (pixel[:, 1] < maps.height - 0.5)
@@ -111,15 +115,17 @@ def _look(
     needed = torch.zeros_like(inside)
     needed[index] = True
     safe, color = _sample(pixel, depth, needed.nonzero()[:, 0], maps, view, tolerance)
-    seen = safe[index].amin(1)
-    face, index, seen = face[seen > 0], index[seen > 0], seen[seen > 0]
+    at = safe[index]
+    share = (at > 0).to(torch.float32).mean(1)
+    enough = share > MIN_SHARE
+    face, index, at, share = face[enough], index[enough], at[enough], share[enough]
     a, b, c = pixel[index[:, :3]].unbind(1)
     area = ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]).abs() / 2
     center = -maps.world_to_camera[view, :3, :3].T @ maps.world_to_camera[view, :3, 3]
     ray = F.normalize(points.position[index[:, 6]] - center.to(points.position), dim=1)
     cosine = (normal[face] * ray).sum(1).abs()
     cost = -0.5 * area.clamp(min=1e-6).log() - GRAZING_WEIGHT * cosine.clamp(min=1e-3).log()
-    cost += EDGE_WEIGHT * (1 - seen) + SHARPNESS_WEIGHT * blur
+    cost += HIDDEN_WEIGHT * (1 - share) + EDGE_WEIGHT * (1 - at.amin(1)) + SHARPNESS_WEIGHT * blur
     worst, place = kept.cost[face].max(1)
     better = cost < worst
     face, place = face[better], place[better]

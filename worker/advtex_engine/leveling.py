@@ -15,9 +15,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advtex_engine.assignment import Adjacency, edge_ends
+from advtex_engine.assignment import Adjacency, edge_ends, face_adjacency
+from advtex_engine.reproject import MIN_DEPTH
 from advtex_engine.scene import Mesh
 from advtex_engine.texels import TexelMap, surface_points
+from advtex_engine.texture import bilinear_footprint
 from advtex_engine.views import ViewMaps
 
 LOW_BAND = 8  # pixels that an average takes along each side to be called low-frequency
@@ -99,24 +101,32 @@ def conjugate_gradients(apply: Callable[[Tensor], Tensor], b: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Sampler:
-    """Colors of world points in the views, [N,3] float32; the whole image bicubic, or its low band."""
+    """Where world points are in the views and whether they are seen there, up to `tolerance` metres in depth."""
 
     maps: ViewMaps
+    tolerance: float
 
     def image(self, view: int) -> Tensor:
         """[1,3,H,W] in [0,1]."""
         size = (self.maps.height, self.maps.width, 3)
         return self.maps.color[view].view(size).permute(2, 0, 1)[None].to(torch.float32) / 255
 
-    def grid(self, view: int, points: Tensor) -> Tensor:
-        """World points [N,3] -> positions [1,1,N,2] for grid_sample."""
+    def grid(self, view: int, points: Tensor) -> tuple[Tensor, Tensor]:
+        """World points [N,3] -> positions [1,1,N,2] for grid_sample, and depth [N] in metres."""
         pose = self.maps.world_to_camera[view]
         # float64 would cost twice the time; float32 about the camera's center is as good.
         center = -pose[:3, :3].T @ pose[:3, 3]
         seen = (points - center.to(points)) @ pose[:3, :3].T.to(points)
         focal, principal = self.maps.intrinsics[view, :2], self.maps.intrinsics[view, 2:]
-        pixel = seen[:, :2] / seen[:, 2:].clamp(min=1e-6) * focal + principal
-        return (pixel / pixel.new_tensor([self.maps.width, self.maps.height]) * 2 - 1)[None, None]
+        pixel = seen[:, :2] / seen[:, 2:].clamp(min=MIN_DEPTH) * focal + principal
+        return (pixel / pixel.new_tensor([self.maps.width, self.maps.height]) * 2 - 1)[None, None], seen[:, 2]
+
+    def sees(self, view: int, grid: Tensor, depth: Tensor) -> Tensor:
+        """[N] whether one of the four pixels around a position shows the surface at about this depth."""
+        pixel = (grid[0, 0] + 1) / 2 * grid.new_tensor([self.maps.width, self.maps.height])
+        indices, _ = bilinear_footprint(pixel, self.maps.width, self.maps.height)
+        surface = self.maps.depth[view][indices].to(torch.float32)
+        return ((surface > 0) & ((surface - depth[:, None]).abs() < self.tolerance)).any(1)
 
 
 def full_band(image: Tensor, grid: Tensor) -> Tensor:
@@ -137,28 +147,31 @@ def node_colors(mesh: Mesh, sampler: Sampler, nodes: Nodes) -> Tensor:
     for view in range(sampler.maps.count):
         mine = (nodes.view == view).nonzero()[:, 0]
         if len(mine):
-            grid = sampler.grid(view, mesh.v_pos[nodes.vertex[mine]])
+            grid, _ = sampler.grid(view, mesh.v_pos[nodes.vertex[mine]])
             color[mine] = low_band(sampler.image(view), grid)
     return color
 
 
 @dataclass(frozen=True)
 class Blend:
-    """color: [N,3] of N texels, 0 where no view is known. own: [N] share of the texel's own view in its low band."""
+    """color: [N,3] of N texels, 0 where not known. known: [N] bool, whether the view of the texel's face sees it.
+
+    own: [N] share of that view in the texel's low band.
+    """
 
     color: Tensor
+    known: Tensor
     own: Tensor
 
 
-def blend_texels(
-    mesh: Mesh, texels: TexelMap, label: Tensor, sees: Tensor, maps: ViewMaps, adjacency: Adjacency
-) -> Blend:
+def blend_texels(mesh: Mesh, texels: TexelMap, label: Tensor, sees: Tensor, sampler: Sampler) -> Blend:
     """Colors of texels: detail of their face's view, low band of all views that are shown nearby, leveled.
 
     label: [T] view of each face, -1 = none. sees: [T,K] views that see the face, -1 = none; a view fades only over
     faces that it sees.
     """
-    sampler, nodes = Sampler(maps), make_nodes(mesh.t_pos_idx, label, maps.count)
+    maps, adjacency = sampler.maps, face_adjacency(mesh.t_pos_idx)
+    nodes = make_nodes(mesh.t_pos_idx, label, maps.count)
     offset = seam_offsets(mesh.t_pos_idx, label, adjacency, nodes, node_colors(mesh, sampler, nodes))
     rings = _Rings(mesh.t_pos_idx, len(mesh.v_pos))
     incidence = torch.bincount(nodes.corner[label >= 0].flatten(), minlength=len(nodes.vertex))
@@ -167,6 +180,7 @@ def blend_texels(
     weighted = torch.cat((offset * share, share), 1)
     count = len(texels.texel)
     detail, low, weight, own = (torch.zeros((count, n), device=mesh.v_pos.device) for n in (3, 3, 1, 1))
+    known = torch.zeros(count, dtype=torch.bool, device=mesh.v_pos.device)
     points = surface_points(mesh, texels)
     for view in range(maps.count):
         mine = nodes.view == view
@@ -179,16 +193,16 @@ def blend_texels(
         which = shown[texels.face].nonzero()[:, 0]
         face = texels.face[which]
         at = (field[mesh.t_pos_idx[face]] * texels.barycentric[which].clamp(min=0)[..., None]).sum(1)
-        image, grid = sampler.image(view), sampler.grid(view, points[which])
+        image, (grid, depth) = sampler.image(view), sampler.grid(view, points[which])
         smooth = low_band(image, grid)
         low[which] += at[:, 3:] * smooth + at[:, :3]
         weight[which] += at[:, 3:]
         detailed = (label[face] == view).nonzero()[:, 0]
         detail[which[detailed]] = full_band(image, grid[:, :, detailed]) - smooth[detailed]
         own[which[detailed]] = at[detailed, 3:]
+        known[which[detailed]] = sampler.sees(view, grid[:, :, detailed], depth[detailed])
     weight = weight.clamp(min=1e-6)
-    known = label[texels.face] >= 0
-    return Blend(torch.where(known[:, None], low / weight + detail, 0.0).clamp(0, 1), (own / weight)[:, 0])
+    return Blend(torch.where(known[:, None], low / weight + detail, 0.0).clamp(0, 1), known, (own / weight)[:, 0])
 
 
 class _Rings:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from advtex_engine.assignment import assign_views, face_adjacency
-from advtex_engine.candidates import find_candidates
-from advtex_engine.leveling import blend_texels
+from advtex_engine.assignment import assign_views
+from advtex_engine.candidates import OCCLUSION_SHARE, find_candidates
+from advtex_engine.leveling import Sampler, blend_texels
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.texels import map_texels
 from advtex_engine.texture import fill_holes
@@ -39,18 +39,18 @@ def select_views(given: MethodInput) -> Selection:
     """One view per face, sampled texel by texel from the views at working size, leveled. Not differentiable."""
     atlas, maps = given.atlas, given.maps[1]
     mesh = atlas.mesh
-    candidates = find_candidates(mesh, maps, DEPTH_TOLERANCE[given.scene.kind])
+    # What is hidden by less than this counts as seen.
+    tolerance = DEPTH_TOLERANCE[given.scene.kind] * OCCLUSION_SHARE
+    candidates = find_candidates(mesh, maps, tolerance)
     assignment = assign_views(mesh.t_pos_idx, candidates)
     texels = map_texels(atlas)
-    adjacency = face_adjacency(mesh.t_pos_idx)
-    blend = blend_texels(mesh, texels, assignment.view, candidates.view, maps, adjacency)
-    seen = assignment.view[texels.face] >= 0
+    blend = blend_texels(mesh, texels, assignment.view, candidates.view, Sampler(maps, tolerance))
     color, known, confidence = (
         torch.zeros((atlas.height * atlas.width, *part.shape[1:]), dtype=part.dtype, device=part.device)
-        for part in (blend.color, seen, blend.own)
+        for part in (blend.color, blend.known, blend.own)
     )
-    color[texels.texel], known[texels.texel] = blend.color, seen
-    confidence[texels.texel] = torch.where(seen, blend.own * assignment.agreement[texels.face], 0.0)
+    color[texels.texel], known[texels.texel] = blend.color, blend.known
+    confidence[texels.texel] = torch.where(blend.known, blend.own * assignment.agreement[texels.face], 0.0)
     shape = (atlas.height, atlas.width)
     texture = fill_holes(color.view(*shape, 3), known.view(shape))
     return Selection(texture, known.view(shape), confidence.view(shape), assignment.view)

@@ -129,7 +129,8 @@ def test_nearest_patch_loss_is_its_definition(monkeypatch: pytest.MonkeyPatch) -
     image, truth = noise(15, 17, 1), noise(18, 14, 2)
     expected = brute_nearest(image, truth)
     assert nearest_patch_loss(image, truth) == pytest.approx(expected, rel=1e-4)
-    monkeypatch.setattr(metrics, "CHUNK_BYTES", 4 * 1000)
+    monkeypatch.setattr(metrics, "CHUNK_BYTES", 4 * 100)
+    monkeypatch.setattr(metrics, "PATCH_BLOCK", 25)
     assert nearest_patch_loss(image, truth) == pytest.approx(expected, rel=1e-4)
 
 

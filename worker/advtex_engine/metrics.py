@@ -29,6 +29,8 @@ MAX_PSNR = 100.0
 """Decibels given to equal images."""
 CHUNK_BYTES = 256 << 20
 """Bound on the distance matrix's part that is held at once."""
+PATCH_BLOCK = 1 << 16
+"""Patches of the truth that are held at once: its columns."""
 
 
 def psnr(image: Tensor, truth: Tensor, mask: Tensor) -> float:
@@ -96,20 +98,22 @@ def nearest_patch_loss(
     patches count that lie in it entirely, in both images; without one the images may differ in size. Cost grows with
     the product of the patch counts. NaN when there is no patch.
     """
-    ours = _patches(image, _patch_corners(image, mask, queries, seed))
-    theirs = _patches(truth, _patch_corners(truth, mask))
+    ours, theirs = _patch_corners(image, mask, queries, seed), _patch_corners(truth, mask)
     if len(ours) == 0:
         return math.nan
     # |a - b|^2 = |a|^2 + |b|^2 - 2ab suffers from cancellation unless both sides are centred.
-    center = theirs.mean(0)
-    ours, theirs = ours - center, theirs - center
-    norms = theirs.square().sum(1)
-    rows = max(1, CHUNK_BYTES // (4 * len(theirs)))
+    center = _patches(truth, theirs[:PATCH_BLOCK]).mean(0)
+    rows = max(1, CHUNK_BYTES // (4 * PATCH_BLOCK))
     total = 0.0
     for part in ours.split(rows):  # type: ignore[no-untyped-call]
-        least = torch.addmm(norms, part, theirs.T, alpha=-2).amin(1) + part.square().sum(1)
-        total += float(least.clamp(min=0).double().sqrt().sum())
-    return total / len(ours) / math.sqrt(ours.shape[1])
+        seeking = _patches(image, part) - center
+        least = torch.full((len(part),), math.inf, device=image.device)
+        for block in theirs.split(PATCH_BLOCK):  # type: ignore[no-untyped-call]
+            offered = _patches(truth, block) - center
+            squares = torch.addmm(offered.square().sum(1), seeking, offered.T, alpha=-2)
+            least = torch.minimum(least, squares.amin(1))
+        total += float((least + seeking.square().sum(1)).clamp(min=0).double().sqrt().sum())
+    return total / len(ours) / math.sqrt(PATCH * PATCH * 3)
 
 
 def sliced_wasserstein(image: Tensor, truth: Tensor, mask: Tensor | None = None, *, seed: int = 0) -> float:

@@ -1,0 +1,139 @@
+"""The benchmarks at their smallest: what they write, and that they go on where they stopped."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import discriminator
+import harness
+import pytest
+import sparsity
+import study
+import torch
+
+from advtex_engine.discriminator import PatchDiscriminator
+from advtex_engine.perceptual import NETWORKS
+
+SMALL = ["--views", "6", "--size", "64x64", "--steps", "2", "--faces", "600", "--device", "cpu"]
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """LPIPS with random weights: a number of the right kind, without a download."""
+    folder = tmp_path_factory.mktemp("weights")
+    generator = torch.Generator().manual_seed(0)
+    table, heads = {}, {}
+    for layer in NETWORKS["alexnet"]:
+        shape = (layer.outputs, layer.inputs, layer.kernel, layer.kernel)
+        table[f"features.{layer.number}.weight"] = 0.05 * torch.randn(shape, generator=generator)
+        table[f"features.{layer.number}.bias"] = torch.zeros(layer.outputs)
+    for index, layer in enumerate(NETWORKS["alexnet"]):
+        heads[f"lin{index}.model.1.weight"] = torch.full((1, layer.outputs, 1, 1), 0.01)
+    torch.save(table, folder / "alexnet-owt-7be5be79.pth")
+    torch.save(heads, folder / "alex.pth")
+    return folder
+
+
+def test_results_survive_and_cells_are_found_by_all_their_settings(tmp_path: Path) -> None:
+    results = harness.Results(tmp_path / "new" / "results.json")
+    results.add({"method": "mean", "level": 1.0}, {"lpips": 0.5}, 2.0)
+    results.add({"method": "mean", "level": 2.0}, {"lpips": 0.7}, 2.0)
+    again = harness.Results(tmp_path / "new" / "results.json")
+    found = again.find({"level": 2.0, "method": "mean"})
+    assert found is not None
+    assert found["scores"] == {"lpips": 0.7}
+    assert again.find({"method": "mean"}) is None
+    assert harness.mean_of(again.cells, "lpips") == pytest.approx(0.6)
+
+
+def test_a_page_says_when_and_how_it_was_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["/somewhere/tests/benchmarks/study.py", "--levels", "1", "--results", "a b"])
+    results = harness.Results(tmp_path / "results.json")
+    results.add({"method": "mean"}, {"lpips": 0.25}, 3600.0)
+    table = harness.markdown_table(["method", "LPIPS", "objects"], [["mean", 0.25, 3]])
+    harness.write_report(tmp_path / "page.md", "A study", results.cells, table)
+    page = (tmp_path / "page.md").read_text()
+    assert "    python tests/benchmarks/study.py --levels 1 --results 'a b'\n" in page
+    assert results.cells[0]["date"] in page
+    assert "1.00 hours" in page
+    assert page.endswith("| method | LPIPS | objects |\n| --- | --- | --- |\n| mean | 0.250 | 3 |\n")
+
+
+@pytest.mark.slow
+def test_the_study_makes_a_table_and_does_nothing_twice(
+    tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = [*SMALL, "--models", "1", "--levels", "1", "--lpips-weights", str(weights), "--results", str(tmp_path)]
+    line += ["--errors", "cameras", "--methods", "mean", "colormap", "adversarial_no_condition"]
+    study.main(line)
+    found = json.loads((tmp_path / "study.json").read_text())["cells"]
+    assert len(found) == 3
+    assert {cell["settings"]["refined"] for cell in found if cell["settings"]["method"] == "colormap"} == {True}
+    assert {cell["settings"]["turn"] for cell in found} == {5.0}
+    for cell in found:
+        assert set(cell["scores"]) == set(harness.SCORES)
+        assert cell["scores"]["lpips"] > 0
+    page = (tmp_path / "study.md").read_text()
+    assert page.count("| colormap |") == 1
+    assert (tmp_path / "study.png").stat().st_size > 1000
+
+    monkeypatch.setattr(study, "synthesize", lambda *_, **__: pytest.fail("every cell is there already"))
+    study.main(line)
+
+
+def test_the_errors_of_the_study_are_the_paper_s(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked: list[dict[str, Any]] = []
+    monkeypatch.setattr(study, "synthesize", lambda _folder, **options: asked.append(options))
+    arguments = study.arguments_of(["--models", "1", "--levels", "1", "4.5", "--methods", "mean"])
+    for cell in study.cells(arguments):
+        study.make_scan(tmp_path, cell)
+    told = [(one["camera_error"], one["camera_turn"], one["geometry_error"]) for one in asked]
+    five = 5 * 3.14159265 / 180
+    assert told == [
+        pytest.approx((0.3 * 0.015, five, 0)),
+        pytest.approx((0.3 * 0.01 * 1.5**4.5, five, 0)),
+        pytest.approx((0, 0, 0.3 * 0.03)),
+        pytest.approx((0, 0, 0.3 * 0.02 * 1.5**4.5)),
+    ]
+
+
+@pytest.mark.slow
+def test_sparsity_takes_every_so_many_views(tmp_path: Path, weights: Path) -> None:
+    line = [*SMALL, "--every", "1", "2", "--methods", "mean", "view_selection"]
+    sparsity.main([*line, "--lpips-weights", str(weights), "--results", str(tmp_path)])
+    found = json.loads((tmp_path / "sparsity.json").read_text())["cells"]
+    views = {(cell["settings"]["method"], cell["settings"]["every"]): cell["scores"]["used_views"] for cell in found}
+    assert views == {(method, every): 6 / every for method in ("mean", "view_selection") for every in (1, 2)}
+    assert "| mean | 3 |" in (tmp_path / "sparsity.md").read_text()
+    assert (tmp_path / "sparsity.png").exists()
+
+
+@pytest.mark.slow
+def test_every_option_of_the_discriminator_runs(tmp_path: Path, weights: Path) -> None:
+    discriminator.main([*SMALL, "--lpips-weights", str(weights), "--results", str(tmp_path)])
+    page = (tmp_path / "discriminator.md").read_text()
+    assert all(f"| {option} |" in page for option in discriminator.OPTIONS)
+
+
+@pytest.mark.parametrize("patch", sorted(discriminator.PATCHES))
+def test_patches_have_their_size_and_the_common_centers(patch: int) -> None:
+    """By the pixels that a logit's gradient reaches."""
+    network = discriminator.discriminator(patch, 0)
+    condition = torch.zeros((1, 3, 192, 240), requires_grad=True)
+    logits = network(condition, torch.zeros_like(condition))
+    assert logits.shape == PatchDiscriminator()(condition, condition).shape
+    row, column = 10, 14
+    (gradient,) = torch.autograd.grad(logits[0, 0, row, column], [condition])
+    reached = gradient[0].abs().sum(0) > 0
+    rows, columns = reached.any(1).nonzero()[:, 0], reached.any(0).nonzero()[:, 0]
+    assert len(rows) == len(columns) == patch
+    middle = 12 + 8 * torch.tensor([row, column])
+    assert (rows[0] + rows[-1] + 1).item() == 2 * middle[0].item()
+    assert (columns[0] + columns[-1] + 1).item() == 2 * middle[1].item()
+
+
+def test_a_benchmark_without_weights_ends_with_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="no weights"):
+        sparsity.main([*SMALL, "--lpips-weights", str(tmp_path), "--results", str(tmp_path)])

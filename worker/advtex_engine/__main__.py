@@ -80,6 +80,12 @@ def _parser() -> argparse.ArgumentParser:
     texture.add_argument("--size", type=parse_size, help="working size of the views, WIDTHxHEIGHT")
     texture.add_argument("--holdout", type=int, help="leave out the sorted frames whose position %% N == N // 2")
     texture.add_argument("--steps", type=int, help="override the preset's step count")
+    texture.add_argument(
+        "--refine",
+        action=argparse.BooleanOptionalAction,
+        default=TextureConfig.refine,
+        help="refine cameras and exposures first; the preset paper never does, the method colormap always",
+    )
     texture.add_argument("--face-budget", type=int, default=TextureConfig.face_budget)
     texture.add_argument("--max-texture-size", type=int, default=TextureConfig.max_texture_size)
     texture.add_argument("--device", default="auto")

@@ -17,9 +17,8 @@ from advtex_engine.texels import TexelMap, map_texels, surface_points
 from advtex_engine.texture import decode_uv, fill_holes
 from advtex_engine.views import DEPTH_TOLERANCE, ViewMaps
 
-MIN_SEEN = (
-    0.5  # of a face's projected area must be seen, so that a face which is mostly hidden is painted by another view
-)
+MIN_SEEN = 0.5
+"""Share of a face's projected area that a view must see: a face that is mostly hidden is painted by another view."""
 
 Score = Callable[[int, Tensor], Tensor]
 """(view index, visible areas in pixels [F]) -> how good the view is for each face [F]."""

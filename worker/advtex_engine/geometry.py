@@ -15,7 +15,7 @@ from advtex_engine.scene import Mesh
 MIN_RELATIVE_HEIGHT = 1e-7
 # Quadric decimation stops short of its target when it runs out of cheap edges; every further round presses harder.
 DECIMATION_ROUNDS = 4
-DECIMATION_AGGRESSION = 7.0
+DECIMATION_AGGRESSION = 5.0
 
 
 def clean(mesh: Mesh) -> Mesh:
@@ -73,6 +73,8 @@ def decimate(mesh: Mesh, face_budget: int, monitor: Monitor) -> Mesh:
             np.ascontiguousarray(faces, dtype=np.int32),
             target_count=face_budget,
             agg=DECIMATION_AGGRESSION + decimation_round,
+            # Collapsing across a border eats the surface there: 0.45 % of a kitchen's pixels were missed, now 0.1 %.
+            preserve_border=decimation_round < DECIMATION_ROUNDS - 1,
         )
         if len(faces) <= face_budget:
             break

@@ -134,7 +134,7 @@ def test_a_blurred_frame_is_recognized() -> None:
     position, faces = grid(1, side=0.5)
     sharp = torch.randint(0, 256, (HEIGHT, WIDTH, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     rolled = [sharp.roll(step, 1) for step in range(4)]
-    mixed = sum(sharp.roll(step, 1).float() for step in range(5)) / 5
+    mixed = torch.stack([sharp.roll(step, 1).float() for step in range(5)]).mean(0)
     maps = maps_of(Mesh(position, faces), [camera_above(0.0, 0.0, 1.0)] * 5, [*rolled, mixed.to(torch.uint8)])
     blur = frame_blur(maps)
     assert float(blur[4]) > 0.3

@@ -27,6 +27,8 @@ WORKING_WIDTH = 320  # pixels; finer images take longer and gain little
 POINTS_PER_VIEW = 5000
 CHECKED_SHARE = 0.15  # of the points are set aside to judge the result
 CHECKED_PER_VIEW = 1500
+SPREAD_STRIDE = 16  # every so many of the points hold the content in place
+MIN_CANDIDATES = 1000  # points of the drawn ones that two views must see, to refine anything
 CONTRAST_SCALE, COLOR_SCALE = 0.5, 0.1  # disagreements beyond twice that are occlusions or highlights
 LUMINANCE = (0.299, 0.587, 0.114)
 
@@ -56,7 +58,7 @@ def refinement_from_dict(saved: Mapping[str, Any]) -> Refinement:
 
 @dataclass(frozen=True)
 class _Sight:
-    """Images at the working size, their cameras, and the points to fit and to check.
+    """Images at the working size, their cameras, and the points to fit, to hold on to, and to check.
 
     color: [V,3,h,w] float32 in [0,1]. features: `local_contrast` at full resolution. K, given: float64.
     """
@@ -66,6 +68,7 @@ class _Sight:
     K: Tensor
     given: Tensor
     fitted: Observations
+    spread: Observations
     checked: Observations
 
     @property
@@ -79,6 +82,8 @@ def refine_cameras(scene: Scene, device: torch.device, seed: int) -> Refinement:
     On a CPU the same input and seed give the same result. Views that share too little with others keep their pose.
     """
     sight = _look_at(scene, device, seed)
+    if sight is None:
+        return _unmoved(scene)
     found, poses = _poses(sight)
     gain, offset, exposures = _exposures(sight, found)
     scale = scene.views[0].camera.width / sight.size[0]
@@ -105,7 +110,15 @@ def apply_refinement(scene: Scene, refinement: Refinement) -> Scene:
     return replace(scene, views=tuple(views))
 
 
-def _look_at(scene: Scene, device: torch.device, seed: int) -> _Sight:
+def _unmoved(scene: Scene) -> Refinement:
+    """Nothing to go by: everything as it came."""
+    given = torch.stack([view.camera.world_to_camera for view in scene.views]).double()
+    ones = torch.ones((len(given), 3))
+    return Refinement(given, ones, torch.zeros_like(ones), {"mean": {}, "frames": []})
+
+
+def _look_at(scene: Scene, device: torch.device, seed: int) -> _Sight | None:
+    """None when hardly anything is seen by two views."""
     generator = torch.Generator().manual_seed(seed)
     mesh = Mesh(scene.mesh.v_pos.to(device), scene.mesh.t_pos_idx.to(device))
     camera = scene.views[0].camera
@@ -116,17 +129,23 @@ def _look_at(scene: Scene, device: torch.device, seed: int) -> _Sight:
     cameras, depths = surface_depths(mesh, scene.views, size, scene.kind)
     K, given = stack_cameras(cameras, device)
     candidates = draw_candidates(mesh, cameras, depths, features[:, 1:].norm(dim=1), generator)
+    if len(candidates.position) < MIN_CANDIDATES:
+        return None
     order = order_of_preference(candidates, generator)
     aside = round(CHECKED_SHARE * len(order))
     checked = observe(candidates, order[:aside], cameras, depths, CHECKED_PER_VIEW)
     fitted = observe(candidates, order[aside:], cameras, depths, POINTS_PER_VIEW)
-    return _Sight(color, features, K, given, fitted, checked)
+    few = torch.arange(0, len(order), SPREAD_STRIDE, device=order.device)
+    spread = observe(candidates, few, cameras, depths, POINTS_PER_VIEW // 4)
+    return _Sight(color, features, K, given, fitted, spread, checked)
 
 
 def _poses(sight: _Sight) -> tuple[Tensor, dict[str, Tensor]]:
     """Poses [V,4,4] that the checked points approve of, and columns [V] for the report."""
     given, checked = sight.given, sight.checked
-    found = keep_gauge(refine_poses(_luminance(sight.color), sight.K, given, sight.fitted), given, sight.fitted)
+    found = keep_gauge(
+        refine_poses(_luminance(sight.color), sight.K, given, sight.fitted, sight.spread), given, sight.fitted
+    )
     before = look(sight.features, sight.K, given, checked, sight.size)
     after = look(sight.features, sight.K, found, checked, sight.size)
     good = improved(

@@ -9,6 +9,7 @@ from advtex_engine.refine_points import Observations
 from advtex_engine.refine_solve import residuals, weighted_mean
 
 MIN_CHECKED = 50  # points that a view must share with others to be judged
+MARGIN = 0.99  # what has improved by less than that may have by chance
 
 
 def disagreement(value: Tensor, valid: Tensor, points: Observations, scale: float) -> Tensor:
@@ -21,17 +22,17 @@ def disagreement(value: Tensor, valid: Tensor, points: Observations, scale: floa
 
 
 def improved(old: Tensor, new: Tensor, valid: Tensor, points: Observations, scale: float) -> Tensor:
-    """[V] bool: whether each view by itself agrees better with the others' new values with its new ones, or its old.
+    """[V] bool: whether each view agrees better with the others' new values by its own new ones than by its old.
 
     old, new: [V,K,C]; valid: [V,K], where both mean something. False where nothing can be said.
     """
     rest, others = _others(new, valid, points, scale)
-    return _mean((new - rest).abs(), others, scale) < _mean((old - rest).abs(), others, scale)
+    return _mean((new - rest).abs(), others, scale) < MARGIN * _mean((old - rest).abs(), others, scale)
 
 
 def better(new: Tensor, old: Tensor) -> bool:
     """Whether the views of `disagreement` [V] agree better on the whole."""
-    return bool(new.nanmean() < old.nanmean())
+    return bool(new.nanmean() < MARGIN * old.nanmean())
 
 
 def _others(value: Tensor, valid: Tensor, points: Observations, scale: float) -> tuple[Tensor, Tensor]:

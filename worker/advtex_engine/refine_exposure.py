@@ -16,7 +16,7 @@ from advtex_engine.refine_solve import residuals, solve_views
 
 DARK, BRIGHT = 0.02, 0.96  # values beyond are clipped and say nothing about exposure
 ROBUST_SCALE = 0.05  # residual at which an observation loses half of its weight
-GAIN_PRIOR, OFFSET_PRIOR = 0.02, 0.5  # of the number of observations: towards 1 and 0
+GAIN_PRIOR, OFFSET_PRIOR = 0.003, 0.1  # of the number of observations: towards 1 and 0
 ROUNDS = 4
 GAIN_RANGE = (0.5, 2.0)
 OFFSET_RANGE = (-0.1, 0.1)

@@ -117,10 +117,7 @@ def observe(candidates: Candidates, chosen: Tensor, cameras: list[Camera], depth
         taken = found[:most]
         point[view, : len(taken)] = taken
         seen[view, : len(taken)] = True
-    used = torch.zeros(len(position), dtype=torch.bool, device=device)
-    used[point[seen]] = True
-    row = (used.cumsum(0) - 1).clamp(min=0)
-    return Observations(position[used], row[point] * seen, seen)
+    return Observations(position, point, seen)
 
 
 def order_of_preference(candidates: Candidates, generator: torch.Generator) -> Tensor:

@@ -15,13 +15,14 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advtex_engine.refine_points import Observations
-from advtex_engine.refine_solve import residuals, solve_views
+from advtex_engine.refine_solve import Anchor, residuals, solve_views
 
 LEVELS = ((8, 6), (4, 6), (2, 5), (1, 4))  # shrink factor of the image, Gauss-Newton steps
 CONTRAST_RADIUS = 4  # pixels of the level around which local mean and contrast are taken
 CONTRAST_FLOOR = 0.04  # of the range: what is flatter than that counts less
 ROBUST_SCALE = 0.3  # residual, in local contrasts, at which an observation loses half of its weight
-DAMPING = 1e-3  # of the diagonal
+ANCHOR = 0.3  # pull of each place towards where the given cameras show it on the average, relative to the evidence
+PRIOR = 0.003  # pull towards the given pose, relative to the mean strength of the evidence
 LARGEST_STEP = 4.0  # pixels of the level
 
 
@@ -79,23 +80,28 @@ def look(features: Tensor, K: Tensor, world_to_camera: Tensor, points: Observati
     return Looks(value, torch.stack((across, down), -1), uv, local.float(), valid)
 
 
-def refine_poses(luminance: Tensor, K: Tensor, world_to_camera: Tensor, points: Observations) -> Tensor:
+def refine_poses(luminance: Tensor, K: Tensor, given: Tensor, points: Observations, spread: Observations) -> Tensor:
     """world_to_camera [V,4,4] float64 that make the views agree; coarse to fine.
 
-    luminance: [V,h,w] float32 in [0,1]. K: [V,3,3] float64 for that size. The mean motion of all cameras is free here.
+    luminance: [V,h,w] float32 in [0,1]. K: [V,3,3] float64 for that size. points: those compared. spread: points all
+    over the surface, whose content is to stay where it is on the average.
     """
     size = (luminance.shape[2], luminance.shape[1])
+    world_to_camera = given
     for scale, steps in LEVELS:
         features = local_contrast(luminance, scale)
         for _ in range(steps):
             looks = look(features, K, world_to_camera, points, size)
             residual, weight = residuals(looks.value, looks.valid, points, ROBUST_SCALE)
             unit = _units(looks, K)
-            jacobian = _jacobian(looks, K) * unit[..., None]
+            jacobian = pose_jacobian(looks, K) * unit[..., None]
             strength = (jacobian.square() @ weight[..., None])[..., 0]
             # A view without any point gets a prior alone and, its right side being 0, does not move.
-            damping = DAMPING * strength + 1e-6 * strength.mean() + 1e-12
-            step = solve_views(jacobian, residual, weight, points, damping, torch.zeros_like(damping))
+            prior = (PRIOR * strength.mean() + 1e-12).expand_as(strength)
+            moved = twist(world_to_camera @ torch.linalg.inv(given)).float() / unit
+            held = look(features, K, world_to_camera, spread, size)
+            anchor = _anchor(held, world_to_camera, unit, spread, float(strength.mean()))
+            step = solve_views(jacobian, residual, weight, points, prior, moved, anchor)
             longest = step.norm(dim=1).clamp(min=1e-12)
             step = step * (LARGEST_STEP * scale / longest).clamp(max=1)[:, None]
             world_to_camera = exponential((step * unit).double()) @ world_to_camera
@@ -109,7 +115,7 @@ def _units(looks: Looks, K: Tensor) -> Tensor:
     return torch.stack((1 / focal,) * 3 + (depth / focal,) * 3, 1)
 
 
-def _jacobian(looks: Looks, K: Tensor) -> Tensor:
+def pose_jacobian(looks: Looks, K: Tensor) -> Tensor:
     """Derivative [V,6,K] of the value with respect to the twist (rotation, translation) in the camera's frame."""
     x, y, z = looks.local.unbind(-1)
     inverse = 1 / z.clamp(min=1e-6)
@@ -117,6 +123,29 @@ def _jacobian(looks: Looks, K: Tensor) -> Tensor:
     b = looks.gradient[..., 1] * K[:, 1, 1, None].float() * inverse
     c = -(a * x + b * y) * inverse
     return torch.stack((y * c - z * b, z * a - x * c, x * b - y * a, a, b, c), 1)
+
+
+def _anchor(looks: Looks, world_to_camera: Tensor, unit: Tensor, points: Observations, strength: float) -> Anchor:
+    """Holds the content of the surface where the given cameras show it on the average.
+
+    A camera's motion moves what it shows at a point by R^T (rotation x local + translation) in the world; across the
+    ray and divided by the distance that is an angle, times the focal length pixels.
+    """
+    local = looks.local
+    distance = local.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+    ray = local / distance
+    # Rows of (I - ray ray^T) [-[local]x, I] / distance, turned into the world.
+    identity = torch.eye(3, dtype=local.dtype, device=local.device)
+    across = (identity - ray[..., :, None] * ray[..., None, :]) / distance[..., None]
+    across = world_to_camera[:, None, :3, :3].mT.to(local.dtype) @ across
+    focal = 1 / unit[:, 0, None]
+    components = []
+    for axis in range(3):
+        row = across[:, :, axis]
+        whole = torch.cat((torch.linalg.cross(local, row), row), -1) * focal[..., None] * unit[:, None]
+        components.append(whole.mT.contiguous())
+    evidence = strength / looks.valid.sum(1).clamp(min=1).to(local.dtype).mean()
+    return Anchor(tuple(components), looks.valid * (ANCHOR * evidence), points)
 
 
 def exponential(twist: Tensor) -> Tensor:
@@ -129,3 +158,11 @@ def exponential(twist: Tensor) -> Tensor:
     motion[:, :3, 3] = twist[:, 3:]
     motion[:, 3, 3] = 1
     return motion
+
+
+def twist(motion: Tensor) -> Tensor:
+    """Twists [V,6] of rigid motions [V,4,4] by less than a right angle; the inverse of `exponential`."""
+    skew = 0.5 * (motion[:, :3, :3] - motion[:, :3, :3].mT)
+    axis = torch.stack((skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]), 1)
+    sine = axis.norm(dim=1, keepdim=True).clamp(min=1e-12)
+    return torch.cat((axis * (sine.clamp(max=1).asin() / sine), motion[:, :3, 3]), 1)

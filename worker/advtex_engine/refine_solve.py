@@ -9,12 +9,14 @@ is a mean) couples the views instead, and conjugate gradients solve that without
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from advtex_engine.refine_points import Observations
 
-SOLVER_STEPS = 20
+SOLVER_STEPS = 30
 ROBUST_ROUNDS = 3
 
 
@@ -37,8 +39,40 @@ def residuals(value: Tensor, valid: Tensor, points: Observations, scale: float) 
     return residual, weight
 
 
+@dataclass(frozen=True)
+class Anchor:
+    """What must not move on the average: for each component [V,Q,K] of `jacobian` and each point, the mean over views.
+
+    Adds sum w |mean of jacobian (x + offset)|^2, w = `weight` [V,K] summed over the views of the point.
+    """
+
+    jacobian: tuple[Tensor, ...]
+    weight: Tensor
+    points: Observations
+
+    def product(self, x: Tensor) -> Tensor:
+        """The term's matrix times x [V,Q]."""
+        out = torch.zeros_like(x)
+        for component in self.jacobian:
+            mean, _ = weighted_mean((x[:, None] @ component)[:, 0], self.weight, self.points)
+            out += (component @ (self.weight * mean[self.points.point])[..., None])[..., 0]
+        return out
+
+    def blocks(self) -> Tensor:
+        """The term's matrix within each view, [V,Q,Q]."""
+        _, total = weighted_mean(self.weight, self.weight, self.points)
+        share = self.weight.square() / total.clamp(min=1e-6)[self.points.point]
+        return torch.stack([(component * share[:, None]) @ component.mT for component in self.jacobian]).sum(0)
+
+
 def solve_views(
-    jacobian: Tensor, residual: Tensor, weight: Tensor, points: Observations, prior: Tensor, offset: Tensor
+    jacobian: Tensor,
+    residual: Tensor,
+    weight: Tensor,
+    points: Observations,
+    prior: Tensor,
+    offset: Tensor,
+    anchor: Anchor | None = None,
 ) -> Tensor:
     """The minimizing x [V,Q], preconditioned with each view's own block.
 
@@ -46,18 +80,23 @@ def solve_views(
     """
     weighted = jacobian * weight[:, None]
     blocks = weighted @ jacobian.mT + torch.diag_embed(prior)
+    if anchor is not None:
+        blocks += anchor.blocks()
     factor = torch.linalg.cholesky(blocks.double())
 
     def product(x: Tensor) -> Tensor:
         moved = (x[:, None] @ jacobian)[:, 0]
         mean, _ = weighted_mean(moved, weight, points)
-        return (weighted @ (moved - mean[points.point])[..., None])[..., 0] + prior * x
+        out = (weighted @ (moved - mean[points.point])[..., None])[..., 0] + prior * x
+        return out if anchor is None else out + anchor.product(x)
 
     def precondition(x: Tensor) -> Tensor:
         return torch.cholesky_solve(x.double()[..., None], factor)[..., 0].to(x.dtype)
 
     step = torch.zeros_like(prior)
     rest = -(weighted @ residual[..., None])[..., 0] - prior * offset
+    if anchor is not None:
+        rest -= anchor.product(offset)
     direction = condition = precondition(rest)
     energy = (rest * condition).sum()
     for _ in range(SOLVER_STEPS):

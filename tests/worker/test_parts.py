@@ -24,7 +24,7 @@ from advtex_store.errors import StaleAttempt
 from advtex_store.queue import TASK
 from advtex_store.records import Lease
 from advtex_worker.adapt import texture_config
-from advtex_worker.child import death_sentence
+from advtex_worker.child import child_environment, death_sentence
 from advtex_worker.events import (
     CheckpointEvent,
     Event,
@@ -276,3 +276,18 @@ def test_auto_takes_the_gpu_that_is_free_and_waits_when_none_is(monkeypatch: pyt
     for lock in (second[1], again[1]):
         lock.close()
         Path(lock.name).unlink()
+
+
+def test_the_runner_gets_the_weights_and_no_passwords() -> None:
+    environment = {
+        "PATH": "/bin",
+        "ADVTEX_VGG_WEIGHTS": "/weights",
+        "ADVTEX_LPIPS_WEIGHTS": "/weights",
+        "ADVTEX_DATABASE_URL": "postgresql://user:secret@host",
+        "AWS_SECRET_ACCESS_KEY": "secret",
+    }
+    assert child_environment(environment) == {
+        "PATH": "/bin",
+        "ADVTEX_VGG_WEIGHTS": "/weights",
+        "ADVTEX_LPIPS_WEIGHTS": "/weights",
+    }

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -17,6 +17,12 @@ from advtex_worker.events import STOP_LINE, Event, Request, parse_event
 
 LOG_TAIL_BYTES = 6000
 KEPT_OUT = ("ADVTEX_", "AWS_")  # the runner reads hostile files: it gets no passwords
+PASSED_ON = ("ADVTEX_LPIPS_WEIGHTS", "ADVTEX_VGG_WEIGHTS")  # folders that the engine reads
+
+
+def child_environment(environment: Mapping[str, str]) -> dict[str, str]:
+    """What the runner may know of the worker's environment."""
+    return {name: value for name, value in environment.items() if name in PASSED_ON or not name.startswith(KEPT_OUT)}
 
 
 class Child:
@@ -30,7 +36,7 @@ class Child:
         self._log = log
         self._lock = threading.Lock()
         self.returncode = 0
-        environment = {name: value for name, value in os.environ.items() if not name.startswith(KEPT_OUT)}
+        environment = child_environment(os.environ)
         for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
             environment[name] = str(threads)
         with log.open("ab") as sink:

@@ -143,9 +143,7 @@ def _look_at(scene: Scene, device: torch.device, seed: int) -> _Sight | None:
 def _poses(sight: _Sight) -> tuple[Tensor, dict[str, Tensor]]:
     """Poses [V,4,4] that the checked points approve of, and columns [V] for the report."""
     given, checked = sight.given, sight.checked
-    found = keep_gauge(
-        refine_poses(_luminance(sight.color), sight.K, given, sight.fitted, sight.spread), given, sight.fitted
-    )
+    found = refine_poses(_luminance(sight.color), sight.K, given, sight.fitted, sight.spread)
     before = look(sight.features, sight.K, given, checked, sight.size)
     after = look(sight.features, sight.K, found, checked, sight.size)
     good = improved(
@@ -176,29 +174,6 @@ def _exposures(sight: _Sight, world_to_camera: Tensor) -> tuple[Tensor, Tensor, 
     if not better(new, old):
         gain, offset, new, good = torch.ones_like(gain), torch.zeros_like(offset), old, torch.zeros_like(good)
     return gain, offset, {"color_before": old, "color_after": new, "kept_exposure": ~good[:, 0]}
-
-
-def keep_gauge(found: Tensor, given: Tensor, points: Observations) -> Tensor:
-    """Cameras [V,4,4] without their mean motion.
-
-    Removed is the rigid motion of the world that takes what the new cameras see to where the given ones see it
-    (Kabsch), weighted by 1/z^2, so that it is pixels that count.
-    """
-    world = points.position[points.point]
-    local = world @ given[:, :3, :3].mT + given[:, None, :3, 3]
-    moved = (local - found[:, None, :3, 3]) @ found[:, :3, :3]
-    weight = (points.seen / local[..., 2].clamp(min=1e-6).square()).flatten()[:, None]
-    weight = weight / weight.sum().clamp(min=1e-30)
-    source, target = moved.flatten(0, 1), world.flatten(0, 1)
-    from_center, to_center = (source * weight).sum(0), (target * weight).sum(0)
-    u, _, vt = torch.linalg.svd((weight * (target - to_center)).T @ (source - from_center))
-    sign = torch.ones(3, dtype=u.dtype, device=u.device)
-    sign[2] = torch.linalg.det(u @ vt)
-    rotation = (u * sign) @ vt
-    back = torch.eye(4, dtype=u.dtype, device=u.device)
-    back[:3, :3] = rotation.T
-    back[:3, 3] = from_center - rotation.T @ to_center
-    return found @ back
 
 
 def _motion(found: Tensor, given: Tensor, K: Tensor, points: Observations) -> Tensor:

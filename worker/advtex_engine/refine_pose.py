@@ -21,8 +21,8 @@ LEVELS = ((8, 6), (4, 6), (2, 5), (1, 4))  # shrink factor of the image, Gauss-N
 CONTRAST_RADIUS = 4  # pixels of the level around which local mean and contrast are taken
 CONTRAST_FLOOR = 0.04  # of the range: what is flatter than that counts less
 ROBUST_SCALE = 0.3  # residual, in local contrasts, at which an observation loses half of its weight
-ANCHOR = 0.3  # pull of each place towards where the given cameras show it on the average, relative to the evidence
-PRIOR = 0.003  # pull towards the given pose, relative to the mean strength of the evidence
+ANCHOR = 0.1  # pull of each place towards where the given cameras show it on the average, relative to the evidence
+PRIOR = 0.001  # pull towards the given pose, relative to the mean strength of the evidence
 LARGEST_STEP = 4.0  # pixels of the level
 
 
@@ -84,11 +84,13 @@ def refine_poses(luminance: Tensor, K: Tensor, given: Tensor, points: Observatio
     """world_to_camera [V,4,4] float64 that make the views agree; coarse to fine.
 
     luminance: [V,h,w] float32 in [0,1]. K: [V,3,3] float64 for that size. points: those compared. spread: points all
-    over the surface, whose content is to stay where it is on the average.
+    over the surface, whose content is to stay where it is on the average. The mean motion of all cameras is removed
+    before each level; the finest one comes after, since not every common motion leaves the photographs in agreement.
     """
     size = (luminance.shape[2], luminance.shape[1])
     world_to_camera = given
     for scale, steps in LEVELS:
+        world_to_camera = keep_gauge(world_to_camera, given, points)
         features = local_contrast(luminance, scale)
         for _ in range(steps):
             looks = look(features, K, world_to_camera, points, size)
@@ -146,6 +148,29 @@ def _anchor(looks: Looks, world_to_camera: Tensor, unit: Tensor, points: Observa
         components.append(whole.mT.contiguous())
     evidence = strength / looks.valid.sum(1).clamp(min=1).to(local.dtype).mean()
     return Anchor(tuple(components), looks.valid * (ANCHOR * evidence), points)
+
+
+def keep_gauge(found: Tensor, given: Tensor, points: Observations) -> Tensor:
+    """Cameras [V,4,4] without their mean motion.
+
+    Removed is the rigid motion of the world that takes what the new cameras see to where the given ones see it
+    (Kabsch), weighted by 1/z^2, so that it is pixels that count.
+    """
+    world = points.position[points.point]
+    local = world @ given[:, :3, :3].mT + given[:, None, :3, 3]
+    moved = (local - found[:, None, :3, 3]) @ found[:, :3, :3]
+    weight = (points.seen / local[..., 2].clamp(min=1e-6).square()).flatten()[:, None]
+    weight = weight / weight.sum().clamp(min=1e-30)
+    source, target = moved.flatten(0, 1), world.flatten(0, 1)
+    from_center, to_center = (source * weight).sum(0), (target * weight).sum(0)
+    u, _, vt = torch.linalg.svd((weight * (target - to_center)).T @ (source - from_center))
+    sign = torch.ones(3, dtype=u.dtype, device=u.device)
+    sign[2] = torch.linalg.det(u @ vt)
+    rotation = (u * sign) @ vt
+    back = torch.eye(4, dtype=u.dtype, device=u.device)
+    back[:3, :3] = rotation.T
+    back[:3, 3] = from_center - rotation.T @ to_center
+    return found @ back
 
 
 def exponential(twist: Tensor) -> Tensor:

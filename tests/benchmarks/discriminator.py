@@ -2,10 +2,10 @@
 
     python tests/benchmarks/discriminator.py [--seeds 1]
 
-One synthesized scan, as `advtex-engine synthesize` makes it; the texture starts at the mean and takes the same number
-of steps each time. Patches of 22 pixels replace the last two convolutions by pointwise ones, patches of 118 pixels
-dilate them twice; the patches that count are chosen as for 70 pixels. Writes discriminator.json and discriminator.md
-below --results; goes on with missing cells when run again.
+One synthesized scan, as `advtex-engine synthesize` makes it; the texture takes the same number of steps from the
+preset's start each time. Patches of 22 pixels replace the last two convolutions by pointwise ones, patches of 118
+pixels dilate them twice; the patches that count are chosen as for 70 pixels. Writes discriminator.json and
+discriminator.md below --results; goes on with missing cells when run again.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from harness import (
     parsed_size,
     prepare,
     score_texture,
+    start_texture,
     write_report,
 )
 from torch import Tensor, nn
@@ -107,7 +108,7 @@ def cells(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def optimize(given: MethodInput, seed: int, patch: int = 70, **ablation: bool) -> Tensor:
-    """The texture [H,W,3] on the CPU after the preset's steps from the mean."""
+    """The texture [H,W,3] on the CPU after the preset's steps from its start."""
     maps, kind = given.maps[1], given.scene.kind
     preset = dataclasses.replace(given.preset, **ablation)  # type: ignore[arg-type]  # flags of the ablations
     pairs = own_pairs(maps)
@@ -117,7 +118,7 @@ def optimize(given: MethodInput, seed: int, patch: int = 70, **ablation: bool) -
     optimizer = AdversarialOptimizer(
         maps,
         pairs,
-        given.means[1][maps.slot_map >= 0],
+        start_texture(given)[maps.slot_map >= 0],
         preset,
         kind=kind,
         steps=preset.steps,

@@ -10,6 +10,7 @@ import argparse
 import dataclasses
 import datetime
 import json
+import math
 import shlex
 import sys
 import time
@@ -31,6 +32,7 @@ from advtex_engine.geometry import clean, decimate
 from advtex_engine.ingest import ingest
 from advtex_engine.methods import METHODS, MethodInput
 from advtex_engine.methods.mean import mean_texture
+from advtex_engine.methods.view_selection import select_views
 from advtex_engine.models import load_model
 from advtex_engine.monitor import Monitor
 from advtex_engine.perceptual import Lpips, WeightsError, load_lpips
@@ -102,8 +104,17 @@ def moved(mesh: Mesh, device: torch.device) -> Mesh:
 def run_method(given: MethodInput, method: str) -> Tensor:
     """The method's texture [H,W,3] on the CPU, from the start: what an earlier method left behind is cleared."""
     given.work.clear()
+    if method.startswith("adversarial") and given.preset.start == "selection":
+        given = dataclasses.replace(given, start=start_texture(given))
     texture, _ = METHODS[method](dataclasses.replace(given, config=dataclasses.replace(given.config, method=method)))
     return fill_holes(texture, given.maps[1].slot_map >= 0).cpu()
+
+
+def start_texture(given: MethodInput) -> Tensor:
+    """What the preset has the adversarial methods start from, [H,W,3] in [0,1]."""
+    if given.preset.start == "selection":
+        return select_views(given).texture
+    return torch.zeros_like(given.means[1]) if given.preset.start == "zero" else given.means[1]
 
 
 def needed_lpips(folder: Path | None) -> Lpips:
@@ -115,7 +126,7 @@ def needed_lpips(folder: Path | None) -> Lpips:
 
 
 def score_texture(atlas: Atlas, texture: Tensor, truth: Truth, lpips: Lpips) -> dict[str, float]:
-    """Means over the held-out views, of pixels where both the model and the true object are."""
+    """Means over the held-out views, of pixels where both the model and the true object are; NaN where none has it."""
     atlas = dataclasses.replace(atlas, mesh=moved(atlas.mesh, torch.device("cpu")))
     rows = []
     for camera, image, cover in zip(truth.cameras, truth.images, truth.covers, strict=True):
@@ -124,9 +135,11 @@ def score_texture(atlas: Atlas, texture: Tensor, truth: Truth, lpips: Lpips) -> 
         shown = torch.where(mask[..., None], render, image)
         row = score(Comparison("", image, shown, mask, mask), lpips, {**VIEW_METRICS, **PATCH_METRICS})
         for name in ("s3", "gradient"):
-            row[f"{name}_difference"] = abs(1 - float(row[f"{name}_ratio"] or 0))
+            ratio = row[f"{name}_ratio"]
+            row[f"{name}_difference"] = None if ratio is None else abs(1 - ratio)
         rows.append(row)
-    return {name: sum(float(row[name] or 0) for row in rows) / len(rows) for name in SCORES}
+    known = {name: [value for row in rows if (value := row[name]) is not None] for name in SCORES}
+    return {name: sum(values) / len(values) if values else math.nan for name, values in known.items()}
 
 
 class Results:

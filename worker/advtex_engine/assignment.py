@@ -18,8 +18,8 @@ from advtex_engine.candidates import NO_VIEW, Candidates
 SEAM_COST = 2.0  # of any seam, in units of the data term
 COLOR_COST = 0.1  # difference in color, of 1, that costs as much as SEAM_COST once more
 MAX_COLOR_COST = 3.0
-MESSAGE_ROUNDS = 20
-DAMPING = 0.5
+MESSAGE_ROUNDS = 30
+DAMPING = 0.25
 DESCENT_ROUNDS = 200
 
 

@@ -25,12 +25,14 @@ class Preset:
     """Hyper-parameters of the optimization (paper sections 3.2 and 4; supplement "Training").
 
     levels            coarse-to-fine schedule; one level for everything but `preview`
-    start             "zero" (paper) or "mean" (texture starts as the projected mean)
+    start             "zero" (paper), "mean" (the projected mean) or "selection" (one view per face)
+    pretraining       first steps, counted in `levels`, in which the discriminator learns alone
     lr_texture        1e-3, Adam; colors in [0, 1]
     lr_texture_end    share of lr_texture at the last step, reached in a straight line (paper: 1, no decay)
     lr_discriminator  1e-4, Adam
     beta1             0.5
     l1_weight         lambda = 10 at the start
+    l1_target         "auxiliary" (paper: the warped auxiliary image) or "start" (the start's own render)
     l1_decay          lambda is multiplied by this `l1_decays` times over the run (paper: 0.8 every 1,000 of 50,000)
     max_pair_angle    largest angle between the optical axes of a pair, degrees (released code: 15)
     min_pair_overlap  least share of the source's foreground that the auxiliary view sees
@@ -39,12 +41,14 @@ class Preset:
     """
 
     levels: tuple[PyramidLevel, ...]
-    start: Literal["zero", "mean"]
+    start: Literal["zero", "mean", "selection"]
+    pretraining: int = 0
     lr_texture: float = 1e-3
     lr_texture_end: float = 1.0
     lr_discriminator: float = 1e-4
     beta1: float = 0.5
     l1_weight: float = 10.0
+    l1_target: Literal["auxiliary", "start"] = "auxiliary"
     l1_decay: float = 0.8
     l1_decays: float = 50.0
     max_pair_angle: float = 15.0

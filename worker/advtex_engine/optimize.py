@@ -58,7 +58,8 @@ class AdversarialOptimizer:
     """State and step of one optimization over fixed view maps.
 
     values: start of the compact texture, [slots,3] float32 in [0,1]. steps: the whole run's length, which the decay of
-    lambda is scaled to; `index` counts the steps over all levels of a pyramid.
+    lambda is scaled to; `index` counts the steps over all levels of a pyramid. In the first preset.pretraining of them
+    the discriminator learns alone: a start that is sharp already is spoiled by one that knows nothing.
     """
 
     def __init__(
@@ -79,6 +80,7 @@ class AdversarialOptimizer:
         self.steps, self.index = steps, 0
         self.generator = generator
         self.values = values.clone().to(device).requires_grad_(True)
+        self.start = self.values.detach().clone() if preset.l1_target == "start" else None
         self.discriminator = discriminator
         self.parameters = list(discriminator.parameters())
         self.adam_texture = _adam([self.values], preset.lr_texture, preset.beta1)
@@ -96,9 +98,14 @@ class AdversarialOptimizer:
         return self.preset.l1_weight * self.preset.l1_decay**periods
 
     @property
+    def pretraining(self) -> bool:
+        """Whether the texture still waits for the discriminator."""
+        return self.index < self.preset.pretraining
+
+    @property
     def lr_texture(self) -> float:
         """The texture's learning rate at this step: from lr_texture in a straight line to lr_texture_end of it."""
-        done = self.index / self.steps
+        done = max(0.0, (self.index - self.preset.pretraining) / (self.steps - self.preset.pretraining))
         return self.preset.lr_texture * (1 - (1 - self.preset.lr_texture_end) * done)
 
     def draw(self) -> Batch:
@@ -108,9 +115,12 @@ class AdversarialOptimizer:
     def step(self) -> None:
         """Draws a pair, updates the texture, and the discriminator unless it is ahead (its loss <= the texture's)."""
         losses = self.play(self.draw())
-        gradient = self.texture_gradient(losses)
-        self.update_discriminator(losses)
-        self.update_texture(gradient)
+        if self.pretraining:
+            self.update_discriminator(losses)
+        else:
+            gradient = self.texture_gradient(losses)
+            self.update_discriminator(losses)
+            self.update_texture(gradient)
         self._sums += torch.stack((losses.discriminator, losses.adversarial, losses.l1, losses.ahead)).detach()
         self._summed += 1
         self.index += 1
@@ -118,7 +128,8 @@ class AdversarialOptimizer:
     def play(self, batch: Batch) -> Losses:
         """Renders the fake example and lets the discriminator judge both; one fake forward pass serves both players."""
         masks = patch_masks(batch.foreground, batch.visible)
-        fake = self.sampler.image(sample_texels(self.values, batch.slots, batch.weights)) * 2 - 1
+        fake = self._render(self.values, batch)
+        target = batch.real if self.start is None else self._render(self.start, batch)
         # Without the condition the network sees the example itself beside three empty channels.
         condition = batch.condition if self.preset.condition else torch.zeros_like(batch.condition)
         with self._autocast():
@@ -127,7 +138,13 @@ class AdversarialOptimizer:
         of_discriminator = discriminator_loss(real_logits, fake_logits, masks.discriminator)
         adversarial = adversarial_loss(fake_logits, masks.texture)
         ahead = (of_discriminator <= adversarial).to(torch.float32).detach()
-        return Losses(of_discriminator, adversarial, l1_loss(fake, batch.real, batch.visible), ahead)
+        if self.pretraining:
+            ahead = torch.zeros_like(ahead)
+        return Losses(of_discriminator, adversarial, l1_loss(fake, target, batch.visible), ahead)
+
+    def _render(self, values: Tensor, batch: Batch) -> Tensor:
+        """The compact texture seen by the source view, [1,3,h,w] in [-1,1]."""
+        return self.sampler.image(sample_texels(values, batch.slots, batch.weights)) * 2 - 1
 
     def texture_gradient(self, losses: Losses) -> Tensor:
         """Gradient [slots,3] of the texture's loss; keeps the graph, which the discriminator's gradient needs too."""
@@ -172,6 +189,8 @@ class AdversarialOptimizer:
             "adam_discriminator": self.adam_discriminator.state_dict(),
             "generator": self.generator.get_state(),
         }
+        if self.start is not None:
+            state["start"] = self.start
         return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -180,6 +199,8 @@ class AdversarialOptimizer:
         self.index = int(state["index"])
         with torch.no_grad():
             self.values.copy_(state["values"])
+            if self.start is not None:
+                self.start.copy_(state["start"])
         self.discriminator.load_state_dict(state["discriminator"])
         self.adam_texture.load_state_dict(state["adam_texture"])
         self.adam_discriminator.load_state_dict(state["adam_discriminator"])

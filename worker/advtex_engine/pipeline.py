@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
+from torch import Tensor
 
 from advtex_engine.atlas import build_atlas
 from advtex_engine.cameras import scaled_camera
@@ -22,10 +23,11 @@ from advtex_engine.checkpoint import WorkFolder
 from advtex_engine.config import PRESETS, Preset, PyramidLevel, TextureConfig
 from advtex_engine.errors import OptionError
 from advtex_engine.export import export_model
-from advtex_engine.geometry import clean, decimate
+from advtex_engine.geometry import clean, close_pinholes, decimate
 from advtex_engine.ingest import ingest
 from advtex_engine.methods import METHODS, MethodInput, require
 from advtex_engine.methods.mean import mean_texture
+from advtex_engine.methods.view_selection import select_views
 from advtex_engine.monitor import Monitor
 from advtex_engine.refine import apply_refinement, refine_cameras, refinement_from_dict, refinement_to_dict
 from advtex_engine.report import (
@@ -78,8 +80,10 @@ def texture_scan(
     maps = _view_maps(scene, atlas, preset, folder, stages, device)
     with stages.run("initial_texture"):
         means = {scale: mean_texture(level) for scale, level in maps.items()}
-    with stages.run("optimization"):
         given = MethodInput(scene, atlas, maps, means, preset, config, monitor, folder)
+        if preset.start == "selection" and config.method.startswith("adversarial"):
+            given = replace(given, start=_selected_start(given))
+    with stages.run("optimization"):
         texture, losses = METHODS[config.method](given)
     with stages.run("dilation"):
         texture = fill_holes(texture, maps[1].slot_map >= 0).cpu()
@@ -146,7 +150,7 @@ def _load_scene(scan: Path, config: TextureConfig, folder: WorkFolder, stages: S
     with stages.run("ingest"):
         scene = ingest(scan, config, monitor)
     with stages.run("geometry"):
-        scene = replace(scene, mesh=decimate(clean(scene.mesh), config.face_budget, monitor))
+        scene = replace(scene, mesh=decimate(close_pinholes(clean(scene.mesh)), config.face_budget, monitor))
     folder.save("scene", scene_to_dict(scene))
     stages.save()
     return scene
@@ -214,6 +218,17 @@ def _view_maps(
             folder.save(f"view_maps_{scale}", vars(maps[scale]))
     stages.save()
     return maps
+
+
+def _selected_start(given: MethodInput) -> Tensor:
+    """The texture by view selection; from the work folder when it is there."""
+    saved = given.work.load("initial_texture")
+    if saved is not None:
+        texture: Tensor = saved["texture"].to(given.means[1])
+        return texture
+    texture = select_views(given).texture
+    given.work.save("initial_texture", {"texture": texture})
+    return texture
 
 
 def shrink(view: View, scale: int) -> View:

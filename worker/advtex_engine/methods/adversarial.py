@@ -110,6 +110,8 @@ def _run_level(
 
 def _start(given: MethodInput) -> Tensor:
     """The first level's dense start in [0,1]."""
+    if given.start is not None:
+        return given.start
     first = given.means[given.preset.levels[0].scale]
     return torch.zeros_like(first) if given.preset.start == "zero" else first
 

@@ -23,6 +23,7 @@ class MethodInput:
 
     atlas.mesh is on the device that the run uses; scene's views stay on the CPU.
     means: dense textures [H,W,3] float32 in [0,1], defined on every texel.
+    start: dense texture [H,W,3] that the adversarial methods start from; None: preset.start needs no more than `means`.
     """
 
     scene: Scene
@@ -33,3 +34,4 @@ class MethodInput:
     config: TextureConfig
     monitor: Monitor
     work: WorkFolder
+    start: Tensor | None = None

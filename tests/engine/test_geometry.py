@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from advtex_engine.errors import Problem, ScanError
-from advtex_engine.geometry import clean, close_pinholes, decimate
+from advtex_engine.geometry import clean, decimate
 from advtex_engine.monitor import Monitor
 from advtex_engine.scene import Mesh
 
@@ -153,48 +153,3 @@ def test_decimation_says_that_uv_are_dropped() -> None:
     assert decimate(with_uv, 500, listener).v_uv is None
     assert [problem.code for problem in listener.warnings] == ["uv_dropped"]
     assert "1,280 faces" in listener.warnings[0].message
-
-
-def grid(side: int, without: set[int]) -> Mesh:
-    """A flat square of side x side cells, two faces each; the faces of `without` are left out."""
-    positions = [(float(x), float(y), 0.0) for y in range(side + 1) for x in range(side + 1)]
-    faces = []
-    for y in range(side):
-        for x in range(side):
-            a, b = y * (side + 1) + x, (y + 1) * (side + 1) + x
-            faces += [[a, a + 1, b + 1], [a, b + 1, b]]
-    return make(positions, [face for index, face in enumerate(faces) if index not in without])
-
-
-def area_vectors(mesh: Mesh) -> torch.Tensor:
-    a, b, c = mesh.v_pos[mesh.t_pos_idx].unbind(1)
-    return torch.linalg.cross(b - a, c - a) / 2
-
-
-@pytest.mark.parametrize("hole", [{88}, {88, 89}, {88, 89, 90, 91}])
-def test_pinholes_are_closed_in_the_direction_of_their_neighbors(hole: set[int]) -> None:
-    closed = close_pinholes(grid(10, hole))
-    areas = area_vectors(closed)
-    assert float(areas[:, 2].sum()) == pytest.approx(100.0)
-    assert bool((areas[:, 2] > 0).all())
-    watertight = trimesh.Trimesh(closed.v_pos.numpy(), closed.t_pos_idx.numpy(), process=False)
-    assert len(trimesh.grouping.group_rows(watertight.edges_sorted, require_count=1)) == 40  # the outer border
-
-
-def test_two_pinholes_that_touch_in_a_vertex_keep_the_mesh_as_it_is() -> None:
-    around = grid(10, {88, 110})  # faces of two cells that share a corner only
-    assert close_pinholes(around).t_pos_idx.shape == around.t_pos_idx.shape
-
-
-def test_large_holes_and_separate_pieces_stay() -> None:
-    missing = {2 * (10 * y + x) + side for y in range(3, 7) for x in range(3, 7) for side in (0, 1)}
-    open_square = grid(10, missing)
-    assert close_pinholes(open_square) is open_square
-    piece = make([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], [[0, 1, 2], [0, 2, 3]])
-    assert close_pinholes(piece) is piece
-
-
-def test_pinholes_of_a_mesh_with_uv_stay() -> None:
-    holed = grid(10, {88})
-    textured = Mesh(holed.v_pos, holed.t_pos_idx, holed.v_pos[:, :2] / 10, holed.t_pos_idx)
-    assert close_pinholes(textured) is textured

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from advtex_engine.borders import mend_borders
 from advtex_engine.errors import Problem, ScanError
 from advtex_engine.monitor import Monitor
 from advtex_engine.scene import Mesh
@@ -16,8 +17,6 @@ MIN_RELATIVE_HEIGHT = 1e-7
 # Quadric decimation stops short of its target when it runs out of cheap edges; every further round presses harder.
 DECIMATION_ROUNDS = 4
 DECIMATION_AGGRESSION = 5.0
-# Scanners leave pinholes of a few edges where their blocks meet; larger holes are what the scanner did not see.
-PINHOLE_EDGES = 12
 
 
 def clean(mesh: Mesh) -> Mesh:
@@ -50,42 +49,11 @@ def clean(mesh: Mesh) -> Mesh:
     return Mesh(torch.from_numpy(position), torch.from_numpy(faces), torch.from_numpy(uv), torch.from_numpy(uv_faces))
 
 
-def close_pinholes(mesh: Mesh) -> Mesh:
-    """Fans of triangles over holes with at most PINHOLE_EDGES edges, around a new vertex at their middle.
-
-    mesh: clean. A mesh with uv is returned as it is: new faces would have no place in its texture. The border of a
-    small separate piece is no hole: its fan would face the other way than the faces beside it.
-    """
-    if mesh.t_uv_idx is not None:
-        return mesh
-    position, faces = mesh.v_pos.numpy(), mesh.t_pos_idx.numpy()
-    edges, normals = _border(position, faces)
-    after = _only_successor(edges, len(position))
-    added: list[npt.NDArray[np.int64]] = []
-    centers: list[npt.NDArray[np.float64]] = []
-    for loop in _short_loops(edges, after):
-        corners = position[edges[loop, 0]].astype(np.float64)
-        center = corners.mean(axis=0)
-        fan_normal = np.cross(np.roll(corners, -1, axis=0) - center, corners - center).sum(axis=0)
-        if float(fan_normal @ normals[loop].sum(axis=0)) <= 0:
-            continue
-        # Opposite to the border's direction, so that both sides of each edge agree.
-        middle = np.full(len(loop), len(position) + len(centers))
-        added.append(np.stack((edges[loop, 1], edges[loop, 0], middle), axis=1))
-        centers.append(center)
-    if not added:
-        return mesh
-    return Mesh(
-        torch.from_numpy(np.concatenate((position, np.array(centers, dtype=np.float32)))),
-        torch.from_numpy(np.concatenate((faces, *added))),
-    )
-
-
 def decimate(mesh: Mesh, face_budget: int, monitor: Monitor) -> Mesh:
     """At most `face_budget` faces of a clean mesh, by quadric edge collapse (Garland & Heckbert 1997); deterministic.
 
-    A mesh within the budget is returned as it is, uv included. Decimation moves vertices across uv seams, so that uv
-    are dropped, which the monitor is told.
+    A mesh within the budget is returned as it is, uv included. Else its borders are mended first. Decimation moves
+    vertices across uv seams, so that uv are dropped, which the monitor is told.
     """
     if len(mesh.t_pos_idx) <= face_budget:
         return mesh
@@ -99,7 +67,8 @@ def decimate(mesh: Mesh, face_budget: int, monitor: Monitor) -> Mesh:
                 "raise the face budget, or accept the new atlas",
             )
         )
-    position, faces = mesh.v_pos.numpy(), mesh.t_pos_idx.numpy().astype(np.int32)
+    mended = mend_borders(mesh)
+    position, faces = mended.v_pos.numpy(), mended.t_pos_idx.numpy().astype(np.int32)
     for decimation_round in range(DECIMATION_ROUNDS):
         position, faces = fast_simplification.simplify(
             np.ascontiguousarray(position, dtype=np.float32),
@@ -122,45 +91,6 @@ def decimate(mesh: Mesh, face_budget: int, monitor: Monitor) -> Mesh:
             )
         )
     return decimated
-
-
-def _border(
-    position: npt.NDArray[np.float32], faces: npt.NDArray[np.int64]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
-    """Directed edges [B,2] that only one face has, and that face's normal (of twice its area's length) [B,3]."""
-    corners = position.astype(np.float64)[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    low, high = edges.min(axis=1), edges.max(axis=1)
-    _, inverse, count = np.unique(low * len(position) + high, return_inverse=True, return_counts=True)
-    single = np.flatnonzero(count[inverse] == 1)
-    return edges[single], normals[single // 3]
-
-
-def _only_successor(edges: npt.NDArray[np.int64], vertices: int) -> npt.NDArray[np.int64]:
-    """The border edge that begins where each border edge ends [B]; -1 where there are none or several."""
-    starts = np.bincount(edges[:, 0], minlength=vertices)
-    at = np.full(vertices, -1)
-    at[edges[:, 0]] = np.arange(len(edges))
-    return np.where(starts[edges[:, 1]] == 1, at[edges[:, 1]], -1)
-
-
-def _short_loops(edges: npt.NDArray[np.int64], after: npt.NDArray[np.int64]) -> list[npt.NDArray[np.int64]]:
-    """Closed walks of 3 to PINHOLE_EDGES border edges, each as indices in walking order, every edge in one at most."""
-    first = np.arange(len(edges))
-    here, steps = first, [first]
-    for _ in range(PINHOLE_EDGES - 1):
-        here = np.where(here >= 0, after[here], -1)
-        steps.append(here)
-    walk = np.stack(steps, axis=1)
-    closing = np.where(walk >= 0, after[walk], -1) == first[:, None]
-    length = np.where(closing.any(axis=1), closing.argmax(axis=1) + 1, 0)
-    loops = []
-    for index in np.flatnonzero(length >= 3):
-        loop = walk[index, : length[index]]
-        if index == loop.min():
-            loops.append(loop)
-    return loops
 
 
 def _has_area(position: npt.NDArray[np.float32], faces: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:

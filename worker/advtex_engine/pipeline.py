@@ -23,7 +23,7 @@ from advtex_engine.checkpoint import WorkFolder
 from advtex_engine.config import PRESETS, Preset, PyramidLevel, TextureConfig
 from advtex_engine.errors import OptionError
 from advtex_engine.export import export_model
-from advtex_engine.geometry import clean, close_pinholes, decimate
+from advtex_engine.geometry import clean, decimate
 from advtex_engine.ingest import ingest
 from advtex_engine.methods import METHODS, MethodInput, require
 from advtex_engine.methods.mean import mean_texture
@@ -150,7 +150,7 @@ def _load_scene(scan: Path, config: TextureConfig, folder: WorkFolder, stages: S
     with stages.run("ingest"):
         scene = ingest(scan, config, monitor)
     with stages.run("geometry"):
-        scene = replace(scene, mesh=decimate(close_pinholes(clean(scene.mesh)), config.face_budget, monitor))
+        scene = replace(scene, mesh=decimate(clean(scene.mesh), config.face_budget, monitor))
     folder.save("scene", scene_to_dict(scene))
     stages.save()
     return scene

@@ -8,7 +8,7 @@ import io
 import pytest
 import torch
 
-from advtex_engine.config import PRESETS
+from advtex_engine.config import PRESETS, Preset
 from advtex_engine.discriminator import PatchDiscriminator
 from advtex_engine.losses import adversarial_loss, discriminator_loss, l1_loss, patch_masks
 from advtex_engine.optimize import AdversarialOptimizer, crop_size
@@ -19,13 +19,13 @@ WIDTH, HEIGHT = 96, 72
 PRESET = dataclasses.replace(PRESETS["full"], l1_decays=4)
 
 
-def optimizer(seed: int = 0, steps: int = 20) -> AdversarialOptimizer:
+def optimizer(seed: int = 0, steps: int = 20, preset: Preset = PRESET) -> AdversarialOptimizer:
     maps, pairs = planar_views(4, WIDTH, HEIGHT, 1.2, torch.device("cpu"))
     start = torch.rand(maps.slots, 3, generator=torch.Generator().manual_seed(5))
     network = PatchDiscriminator(torch.Generator().manual_seed(seed))
     generator = torch.Generator().manual_seed(seed)
     return AdversarialOptimizer(
-        maps, pairs, start, PRESET, kind="scene", steps=steps, generator=generator, discriminator=network
+        maps, pairs, start, preset, kind="scene", steps=steps, generator=generator, discriminator=network
     )
 
 
@@ -163,3 +163,51 @@ def test_the_crop_moves_by_about_a_tenth_and_keeps_the_patch_grid(width: int, he
     crop = crop_size(width, height)
     assert (width - crop[0]) % 8 == (height - crop[1]) % 8 == 0
     assert 0.05 <= (width - crop[0]) / width <= 0.15
+
+
+def test_pretraining_moves_the_discriminator_alone() -> None:
+    of = optimizer(preset=dataclasses.replace(PRESET, pretraining=3))
+    start, weights = of.values.detach().clone(), of.parameters[0].detach().clone()
+    for _ in range(3):
+        of.step()
+    assert torch.equal(of.values, start)
+    assert not torch.equal(of.parameters[0], weights)
+    assert of.lr_texture == PRESET.lr_texture
+    of.step()
+    assert not torch.equal(of.values, start)
+
+
+def test_l1_to_the_start_pulls_back_to_it() -> None:
+    of = optimizer(preset=dataclasses.replace(PRESET, l1_target="start", l1_weight=1e6))
+    batch = of.draw()
+    assert float(of.play(batch).l1.detach()) == 0.0
+    start = of.values.detach().clone()
+    with torch.no_grad():
+        of.values += 0.1
+    gradient = of.texture_gradient(of.play(batch))
+    seen = gradient[:, 0].abs() > 1.0
+    assert bool(seen.any())
+    assert bool((gradient[seen] > 0).all())
+    assert of.start is not None
+    assert torch.equal(of.start, start)
+
+
+def test_a_run_that_holds_on_to_its_start_ends_bit_identical_after_a_resume_from_another_start() -> None:
+    preset = dataclasses.replace(PRESET, l1_target="start", pretraining=1)
+    whole, first, second = (optimizer(preset=preset) for _ in range(3))
+    for _ in range(5):
+        whole.step()
+    for _ in range(2):
+        first.step()
+    assert second.start is not None
+    second.start += 0.3  # a later level of a pyramid starts from what the level before made, not from the first start
+    second.load_state_dict(first.state_dict())
+    for _ in range(3):
+        second.step()
+    assert all(torch.equal(a, b) for a, b in zip(state(whole), state(second), strict=True))
+
+
+def test_large_views_are_seen_in_parts() -> None:
+    assert crop_size(640, 480) == (576, 416)
+    assert crop_size(640, 480, (384, 288)) == (384, 288)
+    assert crop_size(320, 240, (384, 288)) == (288, 208)

@@ -34,6 +34,7 @@ class Preset:
     l1_weight         lambda = 10 at the start
     l1_target         "auxiliary" (paper: the warped auxiliary image) or "start" (the start's own render)
     l1_decay          lambda is multiplied by this `l1_decays` times over the run (paper: 0.8 every 1,000 of 50,000)
+    max_crop          largest crop (width, height) in pixels; larger views are seen in parts, for cheaper steps
     max_pair_angle    largest angle between the optical axes of a pair, degrees (released code: 15)
     min_pair_overlap  least share of the source's foreground that the auxiliary view sees
     auxiliary         real examples are warped auxiliary views; else the source itself (ablation, paper section 4)
@@ -51,6 +52,7 @@ class Preset:
     l1_target: Literal["auxiliary", "start"] = "auxiliary"
     l1_decay: float = 0.8
     l1_decays: float = 50.0
+    max_crop: tuple[int, int] | None = None
     max_pair_angle: float = 15.0
     min_pair_overlap: float = 0.3
     auxiliary: bool = True
@@ -65,11 +67,20 @@ class Preset:
 PRESETS: dict[str, Preset] = {
     "paper": Preset(levels=(PyramidLevel(50_000),), start="zero"),
     "full": Preset(levels=(PyramidLevel(50_000),), start="mean"),
-    # In so few steps the discriminator learns little: with lambda falling to nothing, flat walls turn noisy (a kitchen
-    # at 320x240: LPIPS of held-out views .382, averaging .357; with the printed decay per 1,000 steps .343). A texture
-    # that slows down lets the discriminator get ahead and sheds its speckles (a second kitchen, averaging .393: .401
-    # at one rate, .382 at a falling one).
-    "standard": Preset(levels=(PyramidLevel(4_000),), start="mean", l1_decays=4, lr_texture_end=0.1),
+    # From a sharp start the paper's weights blur: the L1 term holds on to the start instead, and only what a
+    # discriminator that has been trained before objects to is changed.
+    "standard": Preset(
+        levels=(PyramidLevel(4_000),),
+        start="selection",
+        pretraining=400,
+        lr_texture=2e-3,
+        lr_texture_end=0.02,
+        lr_discriminator=2e-4,
+        l1_weight=1.0,
+        l1_target="start",
+        l1_decays=0,
+        max_crop=(384, 288),
+    ),
     "preview": Preset(levels=(PyramidLevel(1_500, scale=2), PyramidLevel(400)), start="mean", l1_decays=8),
 }
 METHODS = (

@@ -48,10 +48,11 @@ def native_bfloat16(device: torch.device) -> bool:
     return bool(device.type == "cpu" and probe is not None and probe())
 
 
-def crop_size(width: int, height: int) -> tuple[int, int]:
+def crop_size(width: int, height: int, largest: tuple[int, int] | None = None) -> tuple[int, int]:
     """Fixed size of the randomly placed crop; the margin is a multiple of the patch stride."""
     margin = 8 * max(1, round(CROP_SHARE * width / 8))
-    return max(MIN_SIZE, width - margin), max(MIN_SIZE, height - margin)
+    wide, high = max(MIN_SIZE, width - margin), max(MIN_SIZE, height - margin)
+    return (wide, high) if largest is None else (min(wide, largest[0]), min(high, largest[1]))
 
 
 class AdversarialOptimizer:
@@ -86,7 +87,7 @@ class AdversarialOptimizer:
         self.adam_texture = _adam([self.values], preset.lr_texture, preset.beta1)
         self.adam_discriminator = _adam(self.parameters, preset.lr_discriminator, preset.beta1)
         self.bfloat16 = native_bfloat16(device)
-        self.crop = crop_size(maps.width, maps.height)
+        self.crop = crop_size(maps.width, maps.height, preset.max_crop)
         self.sampler = PairSampler(maps, pairs, kind, self.crop, generator)
         self._sums = torch.zeros(len(LOSS_NAMES), device=device)
         self._summed = 0

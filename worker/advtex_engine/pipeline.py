@@ -131,7 +131,7 @@ def resolve_preset(config: TextureConfig, device: torch.device) -> Preset:
     share = config.steps / preset.steps
     levels = [PyramidLevel(round(level.steps * share), level.scale) for level in preset.levels]
     levels[-1] = PyramidLevel(config.steps - sum(level.steps for level in levels[:-1]), levels[-1].scale)
-    return replace(preset, levels=tuple(levels))
+    return replace(preset, levels=tuple(levels), pretraining=int(preset.pretraining * share))
 
 
 def fingerprint(scan: Path, config: TextureConfig) -> str:

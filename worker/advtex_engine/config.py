@@ -68,7 +68,9 @@ PRESETS: dict[str, Preset] = {
     "paper": Preset(levels=(PyramidLevel(50_000),), start="zero"),
     "full": Preset(levels=(PyramidLevel(50_000),), start="mean"),
     # From a sharp start the paper's weights blur: the L1 term holds on to the start instead, and only what a
-    # discriminator that has been trained before objects to is changed.
+    # discriminator that has been trained before objects to is changed. Two kitchens at 640x480, LPIPS of held-out views
+    # from .231 and .256: at lambda 1 .229 and .262 after 2,400 steps (chair backs bleed onto dark doors), at 5 the
+    # second gives .2556 after 800.
     "standard": Preset(
         levels=(PyramidLevel(4_000),),
         start="selection",
@@ -76,7 +78,7 @@ PRESETS: dict[str, Preset] = {
         lr_texture=3e-4,
         lr_texture_end=0.05,
         lr_discriminator=2e-4,
-        l1_weight=1.0,
+        l1_weight=5.0,
         l1_target="start",
         l1_decays=0,
         max_crop=(384, 288),

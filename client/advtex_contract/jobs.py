@@ -38,10 +38,15 @@ class JobSpec(BaseModel):
     upload_id: str
     options: JobOptions = JobOptions()
     label: Label = ""
+    priority: int = Field(default=0, ge=-100, le=100, description="larger runs earlier, among your own jobs")
+    retention_seconds: int | None = Field(
+        default=None, ge=60, description="how long the job is kept after its end; the server's usual time if left out"
+    )
 
 
 class Progress(BaseModel):
-    """Where a running job stands. `losses` holds the newest values by name; times are seconds."""
+    """Where a running job stands. `losses` holds the newest values by name; times are seconds; `steps_per_second` is
+    this attempt's rate in this stage."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -50,6 +55,7 @@ class Progress(BaseModel):
     steps: int = 0
     losses: dict[str, float] = Field(default_factory=dict)
     stage_seconds: dict[str, float] = Field(default_factory=dict)
+    steps_per_second: float | None = None
     eta_seconds: float | None = None
 
 
@@ -77,7 +83,13 @@ class JobError(BaseModel):
 
 
 class JobView(BaseModel):
-    """A job as the API shows it. `attempt` counts from 1; it is 0 until a worker first takes the job."""
+    """A job as the API shows it.
+
+    attempt: counts from 1; it is 0 until a worker first takes the job.
+    waiting_reason: why the job still waits, in words; empty when it does not.
+    memory_bytes: what a worker must have for it, estimated from its views, texture size and preset.
+    retention_seconds: how long it is kept after its end; then `expires_at` is known.
+    """
 
     model_config = ConfigDict(extra="forbid")
 
@@ -86,7 +98,10 @@ class JobView(BaseModel):
     label: str = ""
     upload_id: str
     options: JobOptions
+    priority: int = 0
     attempt: int = 0
+    waiting_reason: str = ""
+    memory_bytes: int = 0
     progress: Progress = Progress()
     warnings: list[ErrorDetail] = Field(default_factory=list)
     error: JobError | None = None
@@ -94,6 +109,7 @@ class JobView(BaseModel):
     created_at: datetime
     updated_at: datetime
     finished_at: datetime | None = None
+    retention_seconds: int = 0
     expires_at: datetime | None = None
 
 
@@ -128,3 +144,4 @@ class StorageInfo(BaseModel):
 
     max_upload_bytes: int
     retention_seconds: int
+    max_retention_seconds: int

@@ -27,6 +27,7 @@ STORE_CODES: Mapping[type[store.StoreError], ErrorCode] = {
     store.IdempotencyInFlight: ErrorCode.idempotency_in_flight,
     store.NoSpace: ErrorCode.insufficient_storage,
     store.BlobsUnavailable: ErrorCode.unavailable,
+    store.QuotaExceeded: ErrorCode.quota_exceeded,
 }
 HTTP_CODES: Mapping[int, ErrorCode] = {
     401: ErrorCode.unauthorized,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated
@@ -32,6 +33,8 @@ app.add_typer(keys, name="keys")
 
 Host = Annotated[str, typer.Option(help="address to listen on")]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one")]
+MaxActiveJobs = Annotated[int | None, typer.Option(min=0, help="jobs of its owner that have not ended, at most")]
+MaxBytes = Annotated[int | None, typer.Option(min=0, help="bytes of its owner's uploads, at most")]
 
 
 @app.command()
@@ -72,19 +75,31 @@ def create_key(
     owner: Annotated[str | None, typer.Option(help="keys of one owner see the same jobs")] = None,
     scope: Annotated[list[str] | None, typer.Option(help=f"{', '.join(SCOPES)}; can be given several times")] = None,
     days: Annotated[int | None, typer.Option(min=1, help="until the key expires")] = None,
+    max_active_jobs: MaxActiveJobs = None,
+    max_bytes: MaxBytes = None,
 ) -> None:
     """Make a key and print it: it cannot be shown again."""
     expires = None if days is None else (datetime.now(UTC) + timedelta(days=days)).timestamp()
     try:
-        typer.echo(_accounts().create_key(name, owner=owner, scopes=scope or ("read", "write"), expires_at=expires))
+        key = _accounts().create_key(
+            name,
+            owner=owner,
+            scopes=scope or ("read", "write"),
+            expires_at=expires,
+            max_active_jobs=max_active_jobs,
+            max_bytes=max_bytes,
+        )
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
+    typer.echo(key)
 
 
 @keys.command("list")
 def list_keys() -> None:
-    """One JSON object per key, without secrets."""
-    for row in _accounts().list_keys():
+    """One JSON object per key, without secrets; with what its owner has of what is limited."""
+    accounts = _accounts()
+    for row in accounts.list_keys():
+        usage = accounts.usage(row.owner)
         typer.echo(
             json.dumps(
                 {
@@ -92,6 +107,10 @@ def list_keys() -> None:
                     "name": row.name,
                     "owner": row.owner,
                     "scopes": row.scopes,
+                    "active_jobs": usage.active_jobs,
+                    "max_active_jobs": row.max_active_jobs,
+                    "bytes": usage.bytes,
+                    "max_bytes": row.max_bytes,
                     "created_at": row.created_at,
                     "expires_at": row.expires_at,
                     "revoked_at": row.revoked_at,
@@ -103,11 +122,25 @@ def list_keys() -> None:
 @keys.command("revoke")
 def revoke_key(key_id: str) -> None:
     """Refuse a key from now on. Give its id, the part between the two underscores."""
-    try:
+    with _known_key():
         _accounts().revoke_key(key_id)
-    except RecordNotFound as error:
-        typer.echo(str(error), err=True)
-        raise typer.Exit(1) from None
+
+
+@keys.command("rotate")
+def rotate_key(
+    key_id: str,
+    keep_hours: Annotated[float, typer.Option(min=0, help="how long the old key goes on working")] = 0,
+) -> None:
+    """Replace a key by a new one that sees and may do the same, and print it."""
+    with _known_key():
+        typer.echo(_accounts().rotate_key(key_id, keep_hours * 3600))
+
+
+@keys.command("limit")
+def limit_key(key_id: str, max_active_jobs: MaxActiveJobs = None, max_bytes: MaxBytes = None) -> None:
+    """Set both limits of a key; what is left out is not limited."""
+    with _known_key():
+        _accounts().set_quota(key_id, max_active_jobs, max_bytes)
 
 
 def main() -> None:
@@ -119,6 +152,15 @@ def _accounts() -> Accounts:
     settings = ServerSettings()
     upgrade_database(settings.database)
     return Accounts(Database(settings.database))
+
+
+@contextmanager
+def _known_key() -> Iterator[None]:
+    try:
+        yield
+    except RecordNotFound as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(1) from None
 
 
 def _guarded(

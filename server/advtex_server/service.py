@@ -32,6 +32,7 @@ from advtex_scan.check import check_scan
 from advtex_server.refusal import ApiError
 from advtex_server.settings import ServerSettings
 from advtex_store import keys
+from advtex_store.accounts import Caller
 from advtex_store.blobs import FolderBlobs
 from advtex_store.errors import BlobNotFound
 from advtex_store.models import JobRow, UploadRow
@@ -117,13 +118,18 @@ class Service:
 
     def storage(self) -> StorageInfo:
         return StorageInfo(
-            max_upload_bytes=self.settings.max_upload_bytes, retention_seconds=self.settings.retention_seconds
+            max_upload_bytes=self.settings.max_upload_bytes,
+            retention_seconds=self.settings.retention_seconds,
+            max_retention_seconds=self.settings.max_retention_seconds,
         )
 
     # -- jobs -----------------------------------------------------------------------------------------------------
 
-    def create_job(self, owner: str, spec: JobSpec, token: str | None) -> tuple[JobView, bool]:
+    def create_job(self, caller: Caller, spec: JobSpec, token: str | None) -> tuple[JobView, bool]:
         """Check the scan and queue the job, or record it as rejected. -> the job, and whether it is new."""
+        owner, most = caller.owner, self.settings.max_retention_seconds
+        if spec.retention_seconds is not None and spec.retention_seconds > most:
+            raise ApiError(ErrorCode.bad_request, f"retention_seconds: jobs are kept for {most} s at most", status=422)
         reservation: Reservation | None = None
         if token is not None:
             held = self.store.submissions.reserve(owner, token, hashlib.sha256(_canonical(spec)).hexdigest())
@@ -133,7 +139,7 @@ class Service:
                 return job_view(held), False
             reservation = held
         try:
-            row = self._checked_job(owner, spec, reservation)
+            row = self._checked_job(caller, spec, reservation)
         except BaseException:
             if reservation is not None:
                 self.store.submissions.release(reservation)
@@ -154,8 +160,8 @@ class Service:
         log.info("cancel asked", job=job_id, state=view.state)
         return view
 
-    def retry(self, owner: str, job_id: str) -> JobView:
-        view = job_view(self.store.records.retry(job_id, owner))
+    def retry(self, caller: Caller, job_id: str) -> JobView:
+        view = job_view(self.store.records.retry(job_id, caller.owner, max_active_jobs=caller.max_active_jobs))
         log.info("retry", job=job_id)
         self.wake()
         return view
@@ -183,7 +189,8 @@ class Service:
         except Exception as error:  # the row, if it is still there, expires within a day, and its blob with it
             log.warning("upload not removed yet", upload=row.id, error=str(error))
 
-    def _checked_job(self, owner: str, spec: JobSpec, reservation: Reservation | None) -> JobRow:
+    def _checked_job(self, caller: Caller, spec: JobSpec, reservation: Reservation | None) -> JobRow:
+        owner = caller.owner
         upload = self.store.uploads.upload(spec.upload_id, owner)
         if upload.sha256 is None:
             raise ApiError(ErrorCode.not_ready, f"upload {upload.id} is not complete: {upload.offset} of {upload.size}")
@@ -194,7 +201,9 @@ class Service:
             for f in report.findings
         ]
         if report.ok:
-            return self.store.submissions.create_job(owner, spec, warnings=details, reservation=reservation)
+            return self.store.submissions.create_job(
+                owner, spec, warnings=details, reservation=reservation, max_active_jobs=caller.max_active_jobs
+            )
         rejection = _rejection(details)
         return self.store.submissions.create_job(owner, spec, rejection=rejection, reservation=reservation)
 
@@ -240,7 +249,10 @@ def job_view(row: JobRow) -> JobView:
         label=row.label,
         upload_id=row.upload_id,
         options=JobOptions.model_validate(row.options),
+        priority=row.priority,
         attempt=row.attempt - 1 if state in WAITING else row.attempt,
+        waiting_reason=(row.waiting_reason or "its turn has not come") if state in WAITING else "",
+        memory_bytes=row.memory_bytes,
         progress=Progress.model_validate(row.progress),
         warnings=[ErrorDetail.model_validate(w) for w in row.warnings],
         error=JobError.model_validate(row.error) if row.error else None,
@@ -248,6 +260,7 @@ def job_view(row: JobRow) -> JobView:
         created_at=_time(row.created_at),
         updated_at=_time(row.updated_at),
         finished_at=_time(row.finished_at) if row.finished_at else None,
+        retention_seconds=row.retention_seconds,
         expires_at=_time(row.expires_at) if row.expires_at else None,
     )
 

@@ -9,11 +9,13 @@ import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import select
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
 
+from advtex_contract.jobs import TERMINAL
 from advtex_store.database import Database
-from advtex_store.errors import RecordNotFound
-from advtex_store.models import ApiKeyRow
+from advtex_store.errors import QuotaExceeded, RecordNotFound
+from advtex_store.models import ApiKeyRow, JobRow, UploadRow
 
 SCOPES = ("read", "write")
 _KEY = re.compile(r"adv_([0-9a-f]{12})_([A-Za-z0-9]{40})")
@@ -27,6 +29,16 @@ class Caller:
     key_id: str
     owner: str
     scopes: frozenset[str]
+    max_active_jobs: int | None = None
+    max_bytes: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """What an owner has: jobs that have not ended, and bytes of uploads that are kept or on their way."""
+
+    active_jobs: int
+    bytes: int
 
 
 class Accounts:
@@ -42,6 +54,8 @@ class Accounts:
         owner: str | None = None,
         scopes: Sequence[str] = ("read", "write"),
         expires_at: float | None = None,
+        max_active_jobs: int | None = None,
+        max_bytes: int | None = None,
     ) -> str:
         """Make a key; the only time that its secret can be seen. Without an owner, it is an owner of its own."""
         if unknown := set(scopes) - set(SCOPES):
@@ -56,6 +70,8 @@ class Accounts:
                     name=name,
                     secret_sha256=hashlib.sha256(secret.encode()).hexdigest(),
                     scopes=sorted(scopes),
+                    max_active_jobs=max_active_jobs,
+                    max_bytes=max_bytes,
                     created_at=self.database.now(session),
                     expires_at=expires_at,
                 )
@@ -77,7 +93,43 @@ class Accounts:
                 return None
             if row.expires_at is not None and row.expires_at <= self.database.now(session):
                 return None
-            return Caller(row.id, row.owner, frozenset(row.scopes))
+            return Caller(row.id, row.owner, frozenset(row.scopes), row.max_active_jobs, row.max_bytes)
+
+    def rotate_key(self, key_id: str, keep_seconds: float = 0.0) -> str:
+        """A new key with everything that the old one had; the old one works for `keep_seconds` more."""
+        with self.database.read() as session:
+            row = session.get(ApiKeyRow, key_id)
+            if row is None or row.revoked_at is not None:
+                raise RecordNotFound(f"there is no key {key_id}, or it was revoked")
+        key = self.create_key(
+            row.name,
+            owner=row.owner,
+            scopes=row.scopes,
+            expires_at=row.expires_at,
+            max_active_jobs=row.max_active_jobs,
+            max_bytes=row.max_bytes,
+        )
+        with self.database.write() as session:
+            old = session.get_one(ApiKeyRow, key_id)
+            end = self.database.now(session) + keep_seconds
+            old.expires_at = end if old.expires_at is None else min(old.expires_at, end)
+        return key
+
+    def set_quota(self, key_id: str, max_active_jobs: int | None, max_bytes: int | None) -> None:
+        """Replace both limits; None for none."""
+        with self.database.write() as session:
+            row = session.get(ApiKeyRow, key_id)
+            if row is None:
+                raise RecordNotFound(f"there is no key {key_id}")
+            row.max_active_jobs, row.max_bytes = max_active_jobs, max_bytes
+
+    def usage(self, owner: str) -> Usage:
+        """What counts towards the quotas."""
+        stored = select(func.coalesce(func.sum(UploadRow.size), 0)).where(
+            UploadRow.owner == owner, UploadRow.deleted_at.is_(None)
+        )
+        with self.database.read() as session:
+            return Usage(_active_jobs(session, owner), int(session.scalar(stored) or 0))
 
     def list_keys(self) -> list[ApiKeyRow]:
         """All keys, oldest first."""
@@ -91,3 +143,21 @@ class Accounts:
             if row is None:
                 raise RecordNotFound(f"there is no key {key_id}")
             row.revoked_at = row.revoked_at or self.database.now(session)
+
+
+def check_active_jobs(session: Session, owner: str, most: int | None) -> None:
+    """QuotaExceeded if one more job would be too many; inside the transaction that adds it."""
+    if most is None:
+        return
+    # The owner's keys are locked, so that two requests at once cannot both take the last place.
+    session.scalars(select(ApiKeyRow.id).where(ApiKeyRow.owner == owner).with_for_update()).all()
+    active = _active_jobs(session, owner)
+    if active >= most:
+        raise QuotaExceeded(f"{active} jobs have not ended yet and this key may have {most}: wait, or cancel some")
+
+
+def _active_jobs(session: Session, owner: str) -> int:
+    query = select(func.count()).where(
+        JobRow.owner == owner, JobRow.state.not_in(TERMINAL), JobRow.deleted_at.is_(None)
+    )
+    return session.scalar(query) or 0

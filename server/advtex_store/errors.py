@@ -6,6 +6,7 @@ StoreError
 ├── StaleAttempt          the attempt is no longer the job's current one: stop, write nothing more
 ├── IdempotencyMismatch   the same key came with another body
 ├── IdempotencyInFlight   the same key is being worked on right now
+├── QuotaExceeded         the owner has as much as the key allows
 ├── BlobNotFound
 ├── BlobsUnavailable      the storage cannot be reached now
 └── NoSpace               the disk is full; nothing was kept
@@ -36,6 +37,10 @@ class IdempotencyMismatch(StoreError):
 
 class IdempotencyInFlight(StoreError):
     """A request with this idempotency key has not been answered yet."""
+
+
+class QuotaExceeded(StoreError):
+    """The owner has as many jobs or bytes as the key allows."""
 
 
 class BlobNotFound(StoreError):

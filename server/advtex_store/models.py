@@ -13,7 +13,10 @@ class Base(DeclarativeBase):
 
 
 class ApiKeyRow(Base):
-    """`owner` is what objects belong to, so that a key can be replaced without losing them."""
+    """`owner` is what objects belong to, so that a key can be replaced without losing them.
+
+    max_active_jobs, max_bytes: how much its owner may have before this key is refused more; null for no limit.
+    """
 
     __tablename__ = "api_keys"
 
@@ -22,6 +25,8 @@ class ApiKeyRow(Base):
     name: Mapped[str] = mapped_column(default="")
     secret_sha256: Mapped[str]
     scopes: Mapped[list[Any]]
+    max_active_jobs: Mapped[int | None]
+    max_bytes: Mapped[int | None] = mapped_column(BigInteger)
     created_at: Mapped[float]
     expires_at: Mapped[float | None]
     revoked_at: Mapped[float | None]
@@ -52,6 +57,8 @@ class JobRow(Base):
     version: grows by one with every change that a user can see; the ids of `EventRow`.
     reached, reached_at_claim, deaths: how far any attempt got, where this one began, and how many attempts in a row
     died without getting farther.
+    memory_bytes: what a worker must have (`needs.py`). waiting_reason: the dispatcher's, for people.
+    tidied_at: when what no result needs was removed.
     """
 
     __tablename__ = "jobs"
@@ -62,6 +69,9 @@ class JobRow(Base):
     state: Mapped[str] = mapped_column(String(16))
     label: Mapped[str] = mapped_column(default="")
     options: Mapped[dict[str, Any]]
+    priority: Mapped[int] = mapped_column(default=0)
+    memory_bytes: Mapped[int] = mapped_column(BigInteger, default=0)
+    waiting_reason: Mapped[str] = mapped_column(default="")
     attempt: Mapped[int] = mapped_column(default=1)
     worker: Mapped[str | None]
     lease_expires_at: Mapped[float | None]
@@ -78,7 +88,9 @@ class JobRow(Base):
     created_at: Mapped[float]
     updated_at: Mapped[float]
     finished_at: Mapped[float | None]
+    retention_seconds: Mapped[int]
     expires_at: Mapped[float | None]
+    tidied_at: Mapped[float | None]
     deleted_at: Mapped[float | None]
     purged_at: Mapped[float | None]
 
@@ -106,4 +118,47 @@ class IdempotencyRow(Base):
     holder: Mapped[str]
     held_until: Mapped[float]
     job_id: Mapped[str | None] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"))
+    created_at: Mapped[float]
+
+
+class TallyRow(Base):
+    """What has happened so far, counted in the transaction in which it happened: the metrics of the whole fleet."""
+
+    __tablename__ = "tallies"
+
+    name: Mapped[str] = mapped_column(primary_key=True)
+    label: Mapped[str] = mapped_column(primary_key=True)
+    count: Mapped[int] = mapped_column(BigInteger)
+    total: Mapped[float]
+
+
+class WebhookRow(Base):
+    """Where an owner wants to be told. `failures` counts tries in a row that failed; too many disable it."""
+
+    __tablename__ = "webhooks"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    owner: Mapped[str] = mapped_column(index=True)
+    url: Mapped[str] = mapped_column(Text)
+    secret: Mapped[str]
+    events: Mapped[list[Any]]
+    failures: Mapped[int] = mapped_column(default=0)
+    last_error: Mapped[str] = mapped_column(Text, default="")
+    created_at: Mapped[float]
+    disabled_at: Mapped[float | None]
+
+
+class DeliveryRow(Base):
+    """Outbox of the webhooks, written with the change that it tells of; gone once it was delivered or given up.
+
+    next_try_at: also the end of the time that a server has for the try that it has begun.
+    """
+
+    __tablename__ = "deliveries"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    webhook_id: Mapped[str] = mapped_column(ForeignKey("webhooks.id", ondelete="CASCADE"), index=True)
+    body: Mapped[str] = mapped_column(Text)
+    tries: Mapped[int] = mapped_column(default=0)
+    next_try_at: Mapped[float] = mapped_column(index=True)
     created_at: Mapped[float]

@@ -39,6 +39,7 @@ from advtex_contract.errors import ErrorDetail
 from advtex_contract.jobs import TERMINAL, JobError, JobState, Progress
 from advtex_contract.options import JobOptions
 from advtex_store import keys
+from advtex_store.accounts import check_active_jobs
 from advtex_store.database import Database
 from advtex_store.errors import IllegalTransition, RecordNotFound, StaleAttempt
 from advtex_store.models import EventRow, JobRow
@@ -83,10 +84,9 @@ class Claim:
 class Records:
     """Jobs in the database. Every change of state is one compare-and-set."""
 
-    def __init__(self, database: Database, *, lease_seconds: float = 60.0, retention_seconds: int = 30 * 86400) -> None:
+    def __init__(self, database: Database, *, lease_seconds: float = 60.0) -> None:
         self.database = database
         self.lease_seconds = lease_seconds
-        self.retention_seconds = retention_seconds
 
     # -- worker ---------------------------------------------------------------------------------------------------
 
@@ -256,10 +256,11 @@ class Records:
                 return row
             return self._finish(session, self._move(session, job_id, S.canceled, attempt=row.attempt - 1))
 
-    def retry(self, job_id: str, owner: str | None = None) -> JobRow:
-        """A failed or canceled job goes on from its checkpoint with a new attempt."""
+    def retry(self, job_id: str, owner: str | None = None, *, max_active_jobs: int | None = None) -> JobRow:
+        """A failed or canceled job goes on from its checkpoint with a new attempt. QuotaExceeded."""
         with self.database.write() as session:
             row = self._get(session, job_id, owner, lock=True)
+            check_active_jobs(session, row.owner, max_active_jobs)
             ended = {"cancel_requested": False, "error": None, "finished_at": None, "expires_at": None, "deaths": 0}
             sources = frozenset({S.failed, S.canceled})
             return self._move(session, job_id, S.queued, sources=sources, **ended, **_released(row.attempt + 1))
@@ -326,7 +327,7 @@ class Records:
 
     def _finish(self, session: Session, row: JobRow, **values: Any) -> JobRow:
         row.finished_at = self.database.now(session)
-        row.expires_at = row.finished_at + self.retention_seconds
+        row.expires_at = row.finished_at + row.retention_seconds
         row.lease_expires_at = None
         row.cancel_requested = False
         for name, value in values.items():

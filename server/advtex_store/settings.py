@@ -29,6 +29,7 @@ class StoreSettings(BaseSettings):
         default=60.0, gt=0, description="a running attempt is given up this long after its last heartbeat"
     )
     retention_seconds: int = Field(default=30 * 86400, gt=0, description="how long finished jobs and uploads are kept")
+    max_retention_seconds: int = Field(default=90 * 86400, gt=0, description="the most that a job may ask for")
 
     @property
     def database(self) -> str:

@@ -39,7 +39,7 @@ def open_store(settings: StoreSettings) -> Store:
     """Connect lazily: nothing is contacted before it is used. The schema must be up to date (`upgrade_database`)."""
     database = Database(settings.database)
     retention = settings.retention_seconds
-    records = Records(database, lease_seconds=settings.lease_seconds, retention_seconds=retention)
+    records = Records(database, lease_seconds=settings.lease_seconds)
     blobs = open_blobs(settings.blobs, settings.spool_dir)
     return Store(
         settings=settings,

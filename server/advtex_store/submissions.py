@@ -15,6 +15,7 @@ from sqlalchemy.orm import Session
 
 from advtex_contract.errors import ErrorDetail
 from advtex_contract.jobs import JobError, JobSpec, JobState, Progress
+from advtex_store.accounts import check_active_jobs
 from advtex_store.database import Database
 from advtex_store.errors import IdempotencyInFlight, IdempotencyMismatch, RecordNotFound
 from advtex_store.ids import new_id
@@ -89,9 +90,17 @@ class Submissions:
         warnings: list[ErrorDetail] | None = None,
         rejection: JobError | None = None,
         reservation: Reservation | None = None,
+        memory_bytes: int = 0,
+        max_active_jobs: int | None = None,
     ) -> JobRow:
-        """A job in state `queued`, or `rejected` when there is a rejection. RecordNotFound: no such finished upload."""
+        """A job in state `queued`, or `rejected` when there is a rejection. RecordNotFound: no such finished upload.
+
+        QuotaExceeded: the owner has `max_active_jobs` jobs already that have not ended.
+        """
+        retention = spec.retention_seconds or self.retention_seconds
         with self.database.write() as session:
+            if rejection is None:
+                check_active_jobs(session, owner, max_active_jobs)
             upload = session.scalar(
                 select(UploadRow)
                 .where(UploadRow.id == spec.upload_id, UploadRow.owner == owner)
@@ -102,7 +111,7 @@ class Submissions:
                 raise RecordNotFound(f"there is no finished upload {spec.upload_id}")
             now = self.database.now(session)
             # Also keeps a reconciler that is just letting the upload go from doing so: it looks at this time again.
-            upload.expires_at = max(upload.expires_at or 0.0, now + self.retention_seconds)
+            upload.expires_at = max(upload.expires_at or 0.0, now + retention)
             state = JobState.rejected if rejection else JobState.queued
             row = JobRow(
                 id=new_id(now),
@@ -111,6 +120,8 @@ class Submissions:
                 state=state.value,
                 label=spec.label,
                 options=spec.options.model_dump(mode="json"),
+                priority=spec.priority,
+                memory_bytes=memory_bytes,
                 attempt=0 if rejection else 1,
                 progress=Progress().model_dump(mode="json"),
                 warnings=[w.model_dump(mode="json") for w in warnings or []],
@@ -120,7 +131,8 @@ class Submissions:
                 created_at=now,
                 updated_at=now,
                 finished_at=now if rejection else None,
-                expires_at=now + self.retention_seconds if rejection else None,
+                retention_seconds=retention,
+                expires_at=now + retention if rejection else None,
             )
             session.add(row)
             session.flush()

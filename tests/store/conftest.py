@@ -40,7 +40,7 @@ class Bench:
     accounts: Accounts = field(init=False)
 
     def __post_init__(self) -> None:
-        self.records = Records(self.database, lease_seconds=60, retention_seconds=1000)
+        self.records = Records(self.database, lease_seconds=60)
         self.uploads = Uploads(self.database, retention_seconds=1000)
         self.submissions = Submissions(self.database, retention_seconds=1000)
         self.accounts = Accounts(self.database)

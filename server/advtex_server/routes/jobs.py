@@ -26,7 +26,7 @@ def create_job(
     idempotency_key: Annotated[str | None, Header(min_length=1, max_length=200)] = None,
 ) -> JobView:
     """Texture the scan of a finished upload. A bad scan gives a job in state `rejected` with every finding."""
-    view, new = service.create_job(caller.owner, spec, idempotency_key)
+    view, new = service.create_job(caller, spec, idempotency_key)
     if not new:
         response.status_code = 200
     response.headers["Location"] = f"/v1/jobs/{view.id}"
@@ -61,7 +61,7 @@ def cancel_job(job_id: JobId, caller: Writer, service: TheService) -> JobView:
 @router.post("/{job_id}/retry")
 def retry_job(job_id: JobId, caller: Writer, service: TheService) -> JobView:
     """A failed or canceled job goes on from its checkpoint."""
-    return service.retry(caller.owner, job_id)
+    return service.retry(caller, job_id)
 
 
 @router.delete("/{job_id}", status_code=204)

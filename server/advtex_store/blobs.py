@@ -7,7 +7,6 @@ Names are in `keys.py`. All calls block; the server makes them in threads.
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 import re
@@ -21,10 +20,13 @@ from types import TracebackType
 from typing import IO, Self
 from urllib.parse import unquote, urlsplit
 
-from advtex_store.errors import BlobNotFound, BlobsUnavailable, NoSpace
+from advtex_store.errors import BlobNotFound, BlobsUnavailable
+from advtex_store.files import fsync_dir, translated
+from advtex_store.partials import FolderPartial, Partial, PublishedPartial
 
 CHUNK = 1 << 20
 PLACE_ATTEMPTS = 5
+PARTIAL_SUFFIX = ".partial"
 _KEY = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*(/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
 
 
@@ -82,7 +84,7 @@ class Blobs(ABC):
                     size += len(chunk)
             part.replace(path)
         except OSError as error:
-            raise _translated(error) from error
+            raise translated(error) from error
         finally:
             part.unlink(missing_ok=True)
         return Written(size, digest.hexdigest())
@@ -125,6 +127,21 @@ class Blobs(ABC):
             self.delete(info.key)
 
     @abstractmethod
+    def resume(self, key: str, size: int, offset: int) -> Partial:
+        """Go on with a blob of `size` bytes whose first `offset` ones are held; BlobNotFound if they are not."""
+
+    @abstractmethod
+    def drop_partial(self, key: str) -> None:
+        """Remove the pieces of a blob that was never published; no error if there are none."""
+
+    def is_published(self, key: str, size: int) -> bool:
+        """Whether the whole blob is there."""
+        try:
+            return self.head(key).size == size
+        except BlobNotFound:
+            return False
+
+    @abstractmethod
     def check(self) -> None:
         """Raise (with a sentence that says what is wrong) if the storage cannot be used now."""
 
@@ -158,7 +175,7 @@ class BlobWriter:
             blobs.spool_dir.mkdir(parents=True, exist_ok=True)
             handle, name = tempfile.mkstemp(suffix=".part", dir=blobs.spool_dir)
         except OSError as error:
-            raise _translated(error) from error
+            raise translated(error) from error
         self._path = Path(name)
         self._file: IO[bytes] = os.fdopen(handle, "wb", buffering=CHUNK)
 
@@ -167,7 +184,7 @@ class BlobWriter:
         try:
             self._file.write(chunk)
         except OSError as error:
-            raise _translated(error) from error
+            raise translated(error) from error
         self._digest.update(chunk)
         self.size += len(chunk)
 
@@ -184,7 +201,7 @@ class BlobWriter:
             self._file.close()
             self._blobs._publish(self._path, self._key)
         except OSError as error:
-            raise _translated(error) from error
+            raise translated(error) from error
         finally:
             self.abort()
         return Written(self.size, self.sha256)
@@ -222,7 +239,7 @@ class FolderBlobs(Blobs):
         except FileExistsError:
             return False
         except OSError as error:
-            raise _translated(error) from error
+            raise translated(error) from error
         finally:
             Path(name).unlink(missing_ok=True)
         return True
@@ -274,6 +291,20 @@ class FolderBlobs(Blobs):
         except OSError as error:
             raise BlobsUnavailable(f"the folder {self.root} cannot be written to: {error.strerror}") from error
 
+    def resume(self, key: str, size: int, offset: int) -> Partial:
+        target = self.path(key)
+        path = target.with_name(target.name + PARTIAL_SUFFIX)
+        if not path.exists():
+            if self.is_published(key, size):
+                return PublishedPartial(offset)
+            if offset > 0:
+                raise BlobNotFound(key)
+            self._place(key, lambda _: path.touch())
+        return FolderPartial(path, target, size, offset)
+
+    def drop_partial(self, key: str) -> None:
+        self.delete(key + PARTIAL_SUFFIX)
+
     def _publish(self, path: Path, key: str) -> None:
         self._place(key, path.replace)
 
@@ -288,7 +319,7 @@ class FolderBlobs(Blobs):
             except FileNotFoundError:
                 if attempt == PLACE_ATTEMPTS - 1:
                     raise
-        _fsync_dir(target.parent)
+        fsync_dir(target.parent)
 
     def path(self, key: str) -> Path:
         """Where the blob lies, or would."""
@@ -302,7 +333,7 @@ class FolderBlobs(Blobs):
             folder = folder.parent
         for folder in reversed(missing):
             folder.mkdir(exist_ok=True)
-            _fsync_dir(folder.parent)
+            fsync_dir(folder.parent)
 
 
 def open_blobs(url: str, spool_dir: Path) -> Blobs:
@@ -342,17 +373,3 @@ def _read(file: IO[bytes], start: int, end: int | None) -> Iterator[bytes]:
             if left is not None:
                 left -= len(chunk)
             yield chunk
-
-
-def _fsync_dir(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def _translated(error: OSError) -> Exception:
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return NoSpace(f"the disk is full ({error.strerror})")
-    return error

@@ -7,9 +7,14 @@ the same bytes do no harm to one another.
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
+from pathlib import Path
 from types import TracebackType
 from typing import Self
+
+from advtex_store.errors import BlobNotFound
+from advtex_store.files import fsync_dir, translated
 
 
 class Partial(ABC):
@@ -24,7 +29,7 @@ class Partial(ABC):
 
     @abstractmethod
     def flush(self) -> None:
-        """Everything before `offset` is durable from here on."""
+        """Everything before `offset` is durable from here on. The row is told before the next flush."""
 
     @abstractmethod
     def publish(self) -> None:
@@ -55,3 +60,45 @@ class PublishedPartial(Partial):
 
     def close(self) -> None:
         return
+
+
+class FolderPartial(Partial):
+    """A file beside its final name."""
+
+    def __init__(self, path: Path, target: Path, size: int, offset: int) -> None:
+        super().__init__(offset)
+        self._path = path
+        self._target = target
+        self._size = size
+        self._file = os.open(path, os.O_RDWR)
+        if os.fstat(self._file).st_size < offset:
+            self.close()
+            raise BlobNotFound(f"{path.name}: the first {offset} bytes are not held any more")
+
+    def write(self, data: bytes) -> None:
+        view = memoryview(data)
+        try:
+            while view:
+                written = os.pwrite(self._file, view, self.offset)
+                self.offset += written
+                view = view[written:]
+        except OSError as error:
+            raise translated(error) from error
+
+    def flush(self) -> None:
+        try:
+            os.fsync(self._file)
+        except OSError as error:
+            raise translated(error) from error
+
+    def publish(self) -> None:
+        self.flush()
+        try:
+            self._path.replace(self._target)
+        except FileNotFoundError:  # another request for the same bytes was faster
+            if not self._target.exists() or self._target.stat().st_size != self._size:
+                raise BlobNotFound(self._target.name) from None
+        fsync_dir(self._target.parent)
+
+    def close(self) -> None:
+        os.close(self._file)

@@ -12,6 +12,8 @@ from obstore.store import S3Store
 
 from advtex_store.blobs import BlobInfo, Blobs, check_key, check_prefix
 from advtex_store.errors import BlobNotFound, BlobsUnavailable
+from advtex_store.partials import Partial, PublishedPartial
+from advtex_store.s3_partial import MULTIPART_SUFFIX, S3Multipart, S3Partial
 
 PART = 8 << 20  # bytes per part of a multipart upload and per read
 
@@ -23,6 +25,7 @@ class S3Blobs(Blobs):
     def __init__(self, bucket: str, prefix: str, spool_dir: Path) -> None:
         super().__init__(spool_dir)
         self.bucket = bucket
+        self._multipart = S3Multipart(bucket, f"{prefix}/" if prefix else "")
         self._store = S3Store(
             bucket, prefix=prefix or None, client_options={"allow_http": True}, retry_config={"max_retries": 4}
         )
@@ -59,6 +62,18 @@ class S3Blobs(Blobs):
     def delete(self, key: str) -> None:
         with suppress(BlobNotFound), _translated(key):
             obstore.delete(self._store, check_key(key))
+
+    def resume(self, key: str, size: int, offset: int) -> Partial:
+        if self.is_published(key, size):
+            return PublishedPartial(offset)
+        return S3Partial(self, self._multipart, key, size, offset)
+
+    def drop_partial(self, key: str) -> None:
+        with suppress(BlobNotFound):
+            self._multipart.abort(key, self.get(key + MULTIPART_SUFFIX).decode())
+        for info in self.list(key.rpartition("/")[0] + "/"):
+            if info.key.startswith(f"{key}."):
+                self.delete(info.key)
 
     def check(self) -> None:
         with self._existing_bucket():

@@ -33,7 +33,13 @@ class ApiKeyRow(Base):
 
 
 class UploadRow(Base):
-    """A scan on its way in; complete once `sha256` is set, and only then its blob exists."""
+    """A scan: on its way in, complete (`sha256` is set, and only then its blob exists), or one of the operator's that
+    stays where it is (`source` is its URL).
+
+    offset: bytes that are durable. holder: the newest request for the bytes; only that one may move the offset.
+    announced_sha256: what the client says that the bytes will have; the bytes' own once they are complete.
+    tus_metadata: as the client gave it.
+    """
 
     __tablename__ = "uploads"
 
@@ -43,6 +49,10 @@ class UploadRow(Base):
     size: Mapped[int] = mapped_column(BigInteger)
     offset: Mapped[int] = mapped_column(BigInteger, default=0)
     sha256: Mapped[str | None]
+    announced_sha256: Mapped[str | None] = mapped_column(index=True)
+    holder: Mapped[str | None]
+    tus_metadata: Mapped[str] = mapped_column(Text, default="")
+    source: Mapped[str | None] = mapped_column(Text)
     created_at: Mapped[float]
     expires_at: Mapped[float | None] = mapped_column(index=True)
     deleted_at: Mapped[float | None]
@@ -66,6 +76,7 @@ class JobRow(Base):
     id: Mapped[str] = mapped_column(primary_key=True)
     owner: Mapped[str]
     upload_id: Mapped[str] = mapped_column(ForeignKey("uploads.id"), index=True)
+    batch: Mapped[str | None]
     state: Mapped[str] = mapped_column(String(16))
     label: Mapped[str] = mapped_column(default="")
     options: Mapped[dict[str, Any]]
@@ -94,7 +105,11 @@ class JobRow(Base):
     deleted_at: Mapped[float | None]
     purged_at: Mapped[float | None]
 
-    __table_args__ = (Index("ix_jobs_owner_id", "owner", "id"), Index("ix_jobs_state_id", "state", "id"))
+    __table_args__ = (
+        Index("ix_jobs_owner_id", "owner", "id"),
+        Index("ix_jobs_state_id", "state", "id"),
+        Index("ix_jobs_owner_batch_id", "owner", "batch", "id"),
+    )
 
 
 class EventRow(Base):

@@ -25,7 +25,7 @@ ENV PATH=/opt/advtex/bin:$PATH \
     ADVTEX_DATA_DIR=/var/lib/advtex
 USER 10001
 VOLUME /var/lib/advtex
-# Healthy as long as Redis knows a worker of this host: the worker renews that entry, which else expires.
+# Healthy as long as a worker of this host announces itself.
 HEALTHCHECK --interval=30s --timeout=10s --start-period=30s --retries=3 \
-    CMD ["python", "-c", "import socket, sys; from rq import Worker; from advtex_store.queue import connect_redis; from advtex_store.settings import StoreSettings; sys.exit(socket.gethostname() not in [worker.hostname for worker in Worker.all(connect_redis(StoreSettings()))])"]
+    CMD ["python", "-c", "import socket, sys; from advtex_store.queue import JobQueue, connect_redis; from advtex_store.settings import StoreSettings; sys.exit(not JobQueue(connect_redis(StoreSettings())).workers(socket.gethostname()))"]
 ENTRYPOINT ["advtex-worker"]

@@ -30,6 +30,7 @@ class CheckReport:
     layout, why: the layout's name and what gave it away; empty if none was recognized
     frames_found, frames_usable: in the files, and left after dropped and broken ones
     dropped: frames left out, by reason
+    view_size: width and height of the largest color image, pixels
     """
 
     layout: str = ""
@@ -38,6 +39,7 @@ class CheckReport:
     frames_usable: int = 0
     dropped: Mapping[str, int] = field(default_factory=dict)
     mesh: MeshFacts | None = None
+    view_size: tuple[int, int] = (0, 0)
     findings: tuple[Finding, ...] = ()
 
     @property
@@ -55,6 +57,7 @@ class CheckReport:
             "frames_usable": self.frames_usable,
             "dropped": dict(self.dropped),
             "mesh": asdict(self.mesh) if self.mesh else None,
+            "view_size": list(self.view_size),
             "findings": [asdict(finding) for finding in self.findings],
         }
 
@@ -125,9 +128,15 @@ def read_scan(archive: ScanArchive) -> ScanReading:
         frames_usable=len(manifest.frames) if manifest else 0,
         dropped=dict(reader.dropped),
         mesh=facts,
+        view_size=_largest(manifest),
         findings=reader.findings.result(),
     )
     return ScanReading(manifest, report)
+
+
+def _largest(manifest: ScanManifest | None) -> tuple[int, int]:
+    cameras = [frame.color_intrinsics for frame in manifest.frames] if manifest else []
+    return max(((c.width, c.height) for c in cameras), key=lambda size: size[0] * size[1], default=(0, 0))
 
 
 def _usable(reader: ScanReader, manifest: ScanManifest) -> ScanManifest:

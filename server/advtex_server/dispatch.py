@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections.abc import Sequence
 
 import structlog
 from redis import RedisError
@@ -17,10 +18,18 @@ from starlette.concurrency import run_in_threadpool
 from advtex_contract.jobs import JobState
 from advtex_server.settings import ServerSettings
 from advtex_store.errors import StaleAttempt, StoreError
+from advtex_store.queue import WorkerClass
 from advtex_store.retention import Retention
 from advtex_store.store import Store
 
 SPOOL_SECONDS = 86400.0  # leftovers of killed uploads are removed after this long
+ADOPT_ROWS = 100  # waiting rows that are looked at for a finished result, each time
+REDIS_AWAY = "the queue (Redis) does not answer; the job starts when it is back"
+NO_WORKER = "no worker is running; the job starts when one does"
+TOO_LARGE = (
+    "it needs more memory than the {gib} GiB of the largest worker that is running; start a larger one, or submit it "
+    "again with smaller views or a smaller texture"
+)
 
 log = structlog.get_logger("advtex.dispatch")
 
@@ -68,13 +77,47 @@ class Dispatcher:
                 continue
 
     def dispatch(self) -> int:
-        """Offer the attempts that are next. -> how many were new to Redis. RedisError when it is away."""
+        """Offer the attempts that are next to workers that they fit. -> how many were new to Redis.
+
+        Small workers choose first, so that large ones are free for what fits nowhere else. Few attempts are in Redis at
+        a time: who comes next is decided here, from the rows, as late as possible. RedisError when Redis is away.
+        """
+        queue = self.store.queue
+        try:
+            classes = queue.classes()
+            queue.withdraw({found.gib for found in classes})
+            offered_before = {found.gib: len(queue.waiting_ids(found.gib)) for found in classes}
+            in_redis = sum(offered_before.values())
+            offered = 0
+            for found in classes:
+                room = found.workers * self.settings.queue_depth - offered_before[found.gib]
+                new = self._offer(found, room, in_redis + offered)
+                offered += new
+        except RedisError:
+            self.store.records.explain(REDIS_AWAY)
+            raise
+        self._explain(classes)
+        return offered
+
+    def _offer(self, to: WorkerClass, room: int, in_redis: int) -> int:
+        """The next attempts to one class. A preempted one is not kept waiting for room. -> how many were new."""
         offered = 0
-        for row in self.store.records.waiting(self.settings.queue_depth):
-            if self.store.queue.offer(row.id, row.attempt, front=row.state == JobState.preempted):
-                log.info("enqueued", job=row.id, attempt=row.attempt)
+        for row in self.store.records.waiting(max(room, 1) + in_redis, to.memory_bytes):
+            preempted = row.state == JobState.preempted
+            if offered >= room and not preempted:
+                break
+            if self.store.queue.offer(row.id, row.attempt, to.gib, front=preempted):
+                log.info("enqueued", job=row.id, attempt=row.attempt, worker_gib=to.gib)
                 offered += 1
         return offered
+
+    def _explain(self, classes: Sequence[WorkerClass]) -> None:
+        if not classes:
+            self.store.records.explain(NO_WORKER)
+            return
+        largest = classes[-1]
+        self.store.records.explain("", up_to=largest.memory_bytes)
+        self.store.records.explain(TOO_LARGE.format(gib=largest.gib), above=largest.memory_bytes)
 
     def reconcile(self) -> None:
         """Give up expired leases, adopt results that nobody told the rows about, let go what has expired."""
@@ -87,7 +130,7 @@ class Dispatcher:
             except StaleAttempt:
                 continue
             log.warning("lease expired", job=job_id, attempt=attempt, state=state)
-        for row in self.store.records.waiting(self.settings.queue_depth):
+        for row in self.store.records.waiting(ADOPT_ROWS):
             if row.attempt > 1 and self.store.results.adopt(row.id):
                 log.info("adopted a finished result", job=row.id)
         self.retention.expire()

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import base64
-import binascii
 import hashlib
 import tempfile
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -25,7 +22,6 @@ from advtex_contract.jobs import (
     Progress,
     ResultFile,
     StorageInfo,
-    UploadView,
 )
 from advtex_contract.options import JobOptions
 from advtex_scan.check import check_scan
@@ -36,41 +32,15 @@ from advtex_store.accounts import Caller
 from advtex_store.blobs import FolderBlobs
 from advtex_store.errors import BlobNotFound
 from advtex_store.models import JobRow, UploadRow
+from advtex_store.needs import needed_memory
 from advtex_store.records import WAITING
 from advtex_store.results import StoredFile
 from advtex_store.store import Store
 from advtex_store.submissions import Reservation
 
+IN_LINE = "a worker takes it when its turn comes"
+
 log = structlog.get_logger("advtex.server")
-
-
-class Incoming:
-    """An upload whose bytes are arriving. `write` and `finish` block."""
-
-    def __init__(self, service: Service, row: UploadRow, sha256: str | None) -> None:
-        self._service = service
-        self._sha256 = sha256
-        self.row = row
-        self.writer = service.store.blobs.create(keys.scan_key(row.id))
-
-    def write(self, chunk: bytes) -> None:
-        """Append; ApiError `too_large` beyond the announced size, NoSpace on a full disk."""
-        if self.writer.size + len(chunk) > self.row.size:
-            raise ApiError(ErrorCode.too_large, f"more bytes came than the announced {self.row.size}")
-        self.writer.write(chunk)
-
-    def finish(self) -> UploadView:
-        """Durable from here on. ApiError if bytes are missing or are not those that were announced."""
-        if self.writer.size != self.row.size:
-            raise ApiError(ErrorCode.bad_request, f"{self.writer.size} bytes came, {self.row.size} were announced")
-        if self._sha256 is not None and self.writer.sha256 != self._sha256:
-            raise ApiError(
-                ErrorCode.checksum_mismatch,
-                f"the bytes have sha256 {self.writer.sha256}, announced was {self._sha256}; send them again",
-            )
-        written = self.writer.commit()
-        log.info("upload complete", upload=self.row.id, bytes=written.size, sha256=written.sha256)
-        return upload_view(self._service.store.uploads.finish(self.row.id, written.sha256))
 
 
 class Service:
@@ -80,41 +50,6 @@ class Service:
         self.store = store
         self.settings = settings
         self.wake = wake
-        self._lock = threading.Lock()
-        self._expected_bytes = 0
-
-    # -- uploads --------------------------------------------------------------------------------------------------
-
-    @contextmanager
-    def incoming(self, owner: str, size: int, filename: str, sha256: str | None) -> Iterator[Incoming]:
-        """Room for an upload is held inside the block; leaving it without `finish` keeps nothing."""
-        if size > self.settings.max_upload_bytes:
-            raise ApiError(ErrorCode.too_large, f"uploads may have {self.settings.max_upload_bytes} bytes at most")
-        if size == 0:
-            raise ApiError(ErrorCode.bad_request, "the upload is empty")
-        with self._lock:
-            free = self.store.blobs.free_bytes() - self._expected_bytes
-            if free - size < self.settings.disk_reserve_bytes:
-                raise ApiError(ErrorCode.insufficient_storage, f"no room for {size} bytes on the server's disk")
-            self._expected_bytes += size
-        try:
-            row = self.store.uploads.create(owner, size, filename)
-            try:
-                incoming = Incoming(self, row, sha256)
-                with incoming.writer:
-                    yield incoming
-            except BaseException:
-                self._forget(row)
-                raise
-        finally:
-            with self._lock:
-                self._expected_bytes -= size
-
-    def upload(self, owner: str, upload_id: str) -> UploadView:
-        return upload_view(self.store.uploads.upload(upload_id, owner))
-
-    def delete_upload(self, owner: str, upload_id: str) -> None:
-        self.store.uploads.delete(upload_id, owner)
 
     def storage(self) -> StorageInfo:
         return StorageInfo(
@@ -182,13 +117,6 @@ class Service:
 
     # -- inside ---------------------------------------------------------------------------------------------------
 
-    def _forget(self, row: UploadRow) -> None:
-        try:
-            self.store.uploads.discard(row.id)
-            self.store.blobs.delete(keys.scan_key(row.id))
-        except Exception as error:  # the row, if it is still there, expires within a day, and its blob with it
-            log.warning("upload not removed yet", upload=row.id, error=str(error))
-
     def _checked_job(self, caller: Caller, spec: JobSpec, reservation: Reservation | None) -> JobRow:
         owner = caller.owner
         upload = self.store.uploads.upload(spec.upload_id, owner)
@@ -202,7 +130,12 @@ class Service:
         ]
         if report.ok:
             return self.store.submissions.create_job(
-                owner, spec, warnings=details, reservation=reservation, max_active_jobs=caller.max_active_jobs
+                owner,
+                spec,
+                warnings=details,
+                reservation=reservation,
+                memory_bytes=needed_memory(spec.options, report.frames_usable, *report.view_size),
+                max_active_jobs=caller.max_active_jobs,
             )
         rejection = _rejection(details)
         return self.store.submissions.create_job(owner, spec, rejection=rejection, reservation=reservation)
@@ -251,7 +184,7 @@ def job_view(row: JobRow) -> JobView:
         options=JobOptions.model_validate(row.options),
         priority=row.priority,
         attempt=row.attempt - 1 if state in WAITING else row.attempt,
-        waiting_reason=(row.waiting_reason or "its turn has not come") if state in WAITING else "",
+        waiting_reason=(row.waiting_reason or IN_LINE) if state in WAITING else "",
         memory_bytes=row.memory_bytes,
         progress=Progress.model_validate(row.progress),
         warnings=[ErrorDetail.model_validate(w) for w in row.warnings],
@@ -263,40 +196,6 @@ def job_view(row: JobRow) -> JobView:
         retention_seconds=row.retention_seconds,
         expires_at=_time(row.expires_at) if row.expires_at else None,
     )
-
-
-def upload_view(row: UploadRow) -> UploadView:
-    """The row as the API shows it."""
-    return UploadView(
-        id=row.id,
-        size=row.size,
-        offset=row.offset,
-        complete=row.sha256 is not None,
-        sha256=row.sha256,
-        filename=row.filename,
-        created_at=_time(row.created_at),
-        expires_at=_time(row.expires_at) if row.expires_at else None,
-    )
-
-
-def announced_sha256(content_digest: str | None, x_content_sha256: str | None) -> str | None:
-    """The SHA-256 (hexadecimal) that a request announces: RFC 9530 `Content-Digest: sha-256=:…:`, or plain hex."""
-    if x_content_sha256 is not None:
-        value = x_content_sha256.strip().lower()
-        if len(value) != 64 or set(value) - set("0123456789abcdef"):
-            raise ApiError(ErrorCode.bad_request, "X-Content-SHA256 must be 64 hexadecimal digits")
-        return value
-    for member in (content_digest or "").split(","):
-        name, _, value = member.strip().partition("=")
-        if name == "sha-256":
-            try:
-                digest = base64.b64decode(value.strip(":"), validate=True)
-            except binascii.Error:
-                digest = b""
-            if len(digest) != 32 or not (value.startswith(":") and value.endswith(":")):
-                raise ApiError(ErrorCode.bad_request, "Content-Digest must be sha-256=:base64 of 32 bytes:")
-            return digest.hex()
-    return None
 
 
 def _canonical(spec: JobSpec) -> bytes:

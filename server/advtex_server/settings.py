@@ -16,5 +16,5 @@ class ServerSettings(StoreSettings):
     max_body_bytes: int = Field(default=1 << 20, gt=0, description="of requests that are not uploads")
     dispatch_seconds: float = Field(default=1.0, gt=0, description="between looks at waiting jobs")
     reconcile_seconds: float = Field(default=10.0, gt=0, description="between looks at leases and old blobs")
-    queue_depth: int = Field(default=32, gt=0, description="attempts offered to Redis at a time")
+    queue_depth: int = Field(default=1, gt=0, description="attempts that wait in Redis, per worker")
     shutdown_seconds: int = Field(default=5, gt=0, description="open requests get this long when the server stops")

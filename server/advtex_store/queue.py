@@ -1,13 +1,18 @@
-"""The RQ queue: transport only. Emptied, it costs nothing but a new enqueue by the dispatcher.
+"""The RQ queues: transport only. Emptied, they cost nothing but a new enqueue by the dispatcher.
 
-One queue (RQ then moves ids with BLMOVE, which cannot drop one), JSON instead of pickle, no `Retry`, no time limit and
-no expiry in Redis: attempts, leases and limits live in the rows.
+Workers of one class share one queue, and a worker listens to its own queue only (RQ then moves ids with BLMOVE, which
+cannot drop one). A class is the memory that jobs may use on the worker, in whole GiB. Workers announce themselves, so
+that the dispatcher knows which classes there are. JSON instead of pickle, no `Retry`, no time limit and no expiry in
+Redis: attempts, leases and limits live in the rows.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import Any
 
 from redis import Redis
 from rq import Queue
@@ -15,11 +20,35 @@ from rq.exceptions import DuplicateJobError, NoSuchJobError
 from rq.job import Job
 from rq.serializers import JSONSerializer
 
+from advtex_store.needs import GIB
 from advtex_store.settings import StoreSettings
 
-QUEUE = "advtex"
+QUEUE = "advtex-"
 TASK = "advtex_worker.tasks.run_job"
 STARTED_GRACE_SECONDS = 30.0  # between taking an id and claiming the row; later the taker is held for dead
+PRESENCE = "advtex:worker:"
+PRESENCE_SECONDS = 20  # a worker that has not announced itself for so long is gone
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerClass:
+    """Living workers on which jobs may use `gib` GiB of memory."""
+
+    gib: int
+    workers: int
+
+    @property
+    def memory_bytes(self) -> int:
+        return self.gib * GIB
+
+
+def class_of(memory_bytes: int) -> int:
+    """The class of a worker: whole GiB, so that machines of one kind share a queue."""
+    return memory_bytes // GIB
+
+
+def queue_name(gib: int) -> str:
+    return f"{QUEUE}{gib}"
 
 
 def connect_redis(settings: StoreSettings) -> Redis:
@@ -36,30 +65,50 @@ class JobQueue:
 
     def __init__(self, redis: Redis) -> None:
         self.redis = redis
-        self.rq = Queue(QUEUE, connection=redis, serializer=JSONSerializer)
 
-    def offer(self, job_id: str, attempt: int, *, front: bool = False) -> bool:
-        """Enqueue an attempt unless Redis holds it already. -> whether it was enqueued.
+    def announce(self, name: str, gib: int, connection: Any = None) -> None:
+        """The worker `name` lives. Called by it every few seconds; `connection` may be a pipeline."""
+        (connection or self.redis).set(PRESENCE + name, gib, ex=PRESENCE_SECONDS)
+
+    def depart(self, name: str) -> None:
+        """The worker has ended."""
+        self.redis.delete(PRESENCE + name)
+
+    def workers(self, host: str = "") -> list[str]:
+        """Names of the living workers, of one host or of all."""
+        found = self.redis.scan_iter(match=PRESENCE + "*", count=1000)
+        names = sorted(_text(key).removeprefix(PRESENCE) for key in found)
+        return [name for name in names if not host or name.rpartition("-")[0] == host]
+
+    def classes(self) -> list[WorkerClass]:
+        """The classes of which workers live, smallest first."""
+        names = self.workers()
+        told = self.redis.mget([PRESENCE + name for name in names]) if names else []
+        count = Counter(int(gib) for gib in told if gib is not None)
+        return [WorkerClass(gib, workers) for gib, workers in sorted(count.items())]
+
+    def offer(self, job_id: str, attempt: int, gib: int, *, front: bool = False) -> bool:
+        """Enqueue an attempt unless Redis holds it already, in whichever queue. -> whether it was enqueued.
 
         Offering the same attempt twice is harmless: the row can be claimed once.
         """
-        if self._enqueue(job_id, attempt, front):
+        if self._enqueue(job_id, attempt, gib, front):
             return True
         if self.holds(job_id, attempt):
             return False
         with suppress(NoSuchJobError):
-            Job.fetch(_rq_id(job_id, attempt), connection=self.redis, serializer=JSONSerializer).delete()
-        return self._enqueue(job_id, attempt, front)
+            self._fetch(_rq_id(job_id, attempt)).delete()
+        return self._enqueue(job_id, attempt, gib, front)
 
     def holds(self, job_id: str, attempt: int) -> bool:
         """Whether Redis will deliver the attempt, or has just delivered it to a worker that may be claiming it."""
         rq_id = _rq_id(job_id, attempt)
-        if self.redis.lpos(self.rq.key, rq_id) is not None:
-            return True
         try:
-            job = Job.fetch(rq_id, connection=self.redis, serializer=JSONSerializer)
+            job = self._fetch(rq_id)
         except NoSuchJobError:
             return False
+        if self.redis.lpos(_key(job.origin), rq_id) is not None:
+            return True
         if job.is_finished or job.is_failed or job.is_canceled or job.is_stopped:
             return False
         since = job.started_at or job.enqueued_at
@@ -68,13 +117,29 @@ class JobQueue:
         age = (datetime.now(UTC) - (since if since.tzinfo else since.replace(tzinfo=UTC))).total_seconds()
         return age < STARTED_GRACE_SECONDS
 
-    def depth(self) -> int:
-        """Attempts that wait in Redis."""
-        return int(self.rq.count)
+    def withdraw(self, keep: set[int]) -> None:
+        """Take back what waits for workers of classes that are not in `keep`: nobody listens there any more."""
+        kept = {queue_name(gib) for gib in keep}
+        for raw in self.redis.smembers(Queue.redis_queues_keys):
+            name = _text(raw).removeprefix(Queue.redis_queue_namespace_prefix)
+            if not name.startswith(QUEUE) or name in kept:
+                continue
+            key = _key(name)
+            for rq_id in map(_text, self.redis.lrange(key, 0, -1)):
+                if self.redis.lrem(key, 1, rq_id):  # else a worker has just come and taken it
+                    with suppress(NoSuchJobError):
+                        self._fetch(rq_id).delete()
 
-    def _enqueue(self, job_id: str, attempt: int, front: bool) -> bool:
+    def waiting_ids(self, gib: int) -> list[str]:
+        """`job-attempt` of all that waits for a class, first to last."""
+        return [_text(rq_id) for rq_id in self.redis.lrange(_key(queue_name(gib)), 0, -1)]
+
+    def _fetch(self, rq_id: str) -> Job:
+        return Job.fetch(rq_id, connection=self.redis, serializer=JSONSerializer)
+
+    def _enqueue(self, job_id: str, attempt: int, gib: int, front: bool) -> bool:
         try:
-            self.rq.enqueue_call(
+            Queue(queue_name(gib), connection=self.redis, serializer=JSONSerializer).enqueue_call(
                 TASK,
                 args=(job_id, attempt),
                 job_id=_rq_id(job_id, attempt),
@@ -92,3 +157,11 @@ class JobQueue:
 
 def _rq_id(job_id: str, attempt: int) -> str:
     return f"{job_id}-{attempt}"
+
+
+def _key(name: str) -> str:
+    return f"{Queue.redis_queue_namespace_prefix}{name}"
+
+
+def _text(raw: bytes | str) -> str:
+    return raw.decode() if isinstance(raw, bytes) else raw

@@ -212,11 +212,44 @@ class Records:
 
     # -- dispatcher and reconciler --------------------------------------------------------------------------------
 
-    def waiting(self, limit: int) -> list[JobRow]:
-        """Jobs to run next: preempted ones first, then the oldest."""
+    def waiting(self, limit: int, memory_bytes: int | None = None) -> list[JobRow]:
+        """Jobs to run next, of those that need no more than `memory_bytes`.
+
+        Preempted ones first. Then owners take turns, those first who have the fewest jobs running; among the jobs of
+        one owner the larger priority comes first, then the older job.
+        """
+        waits: list[ColumnElement[bool]] = [JobRow.state.in_(WAITING), JobRow.deleted_at.is_(None)]
+        if memory_bytes is not None:
+            waits.append(JobRow.memory_bytes <= memory_bytes)
+        running = select(JobRow.owner, func.count().label("jobs")).where(JobRow.state == S.running)
+        held = running.group_by(JobRow.owner).subquery()
+        place = func.row_number().over(
+            partition_by=JobRow.owner, order_by=(JobRow.state != S.preempted, JobRow.priority.desc(), JobRow.id)
+        )
+        turn = (place + func.coalesce(held.c.jobs, 0)).label("turn")
+        order = select(JobRow.id, turn).outerjoin(held, held.c.owner == JobRow.owner).where(*waits).subquery()
+        query = select(JobRow).join(order, order.c.id == JobRow.id)
+        query = query.order_by(JobRow.state != S.preempted, order.c.turn, JobRow.id).limit(limit)
         with self.database.read() as session:
-            query = select(JobRow).where(JobRow.state.in_(WAITING), JobRow.deleted_at.is_(None))
-            return list(session.scalars(query.order_by((JobRow.state != S.preempted), JobRow.id).limit(limit)))
+            return list(session.scalars(query))
+
+    def explain(self, reason: str, *, above: int = -1, up_to: int | None = None) -> None:
+        """Tell why jobs wait that need more than `above` and no more than `up_to` bytes of memory."""
+        where: list[ColumnElement[bool]] = [
+            JobRow.state.in_(WAITING),
+            JobRow.deleted_at.is_(None),
+            JobRow.memory_bytes > above,
+            JobRow.waiting_reason != reason,
+        ]
+        if up_to is not None:
+            where.append(JobRow.memory_bytes <= up_to)
+        with self.database.read() as session:
+            if session.scalar(select(JobRow.id).where(*where).limit(1)) is None:
+                return
+        with self.database.write() as session:
+            now = self.database.now(session)
+            values = {"waiting_reason": reason, "version": JobRow.version + 1, "updated_at": now}
+            session.execute(update(JobRow).where(*where).values(**values))
 
     def expired(self, limit: int = 100) -> list[tuple[str, int]]:
         """(job, attempt) whose lease has run out."""

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tomllib
@@ -23,11 +24,10 @@ from live_service import process_tree, wait_until
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
-from rq import Worker
 from tiny_scan import write_scan, write_zip
 
 from advtex_server.settings import ServerSettings
-from advtex_store.queue import QUEUE
+from advtex_store.queue import JobQueue
 from advtex_store.settings import StoreSettings
 from advtex_worker.settings import WorkerSettings
 
@@ -144,11 +144,10 @@ class TestImages:
 
         assert exit_code() == 1
         with redis.Redis.from_url(redis_url) as connection:
-            worker = Worker([QUEUE], connection=connection)
-            worker.register_birth()
+            queue = JobQueue(connection)
+            queue.announce(f"{socket.gethostname()}-1", 8)
             assert exit_code() == 0
-            worker.register_death()
-            connection.delete(worker.key)
+            queue.depart(f"{socket.gethostname()}-1")
         assert exit_code() == 1
 
 

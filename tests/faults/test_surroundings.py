@@ -37,13 +37,19 @@ def test_redis_killed_and_emptied_in_the_middle_of_a_job_costs_nothing(service: 
         assert process_tree(worker.pid)[0] == tree[0], "the worker did not survive"
 
 
+def wait_for_classes(service: LiveService) -> list[int]:
+    wait_until(service.store.queue.classes)
+    return [found.gib for found in service.store.queue.classes()]
+
+
 def test_redis_flushed_while_jobs_wait(service: LiveService, scan: Path) -> None:
     with service.client() as client:
-        jobs = [client.submit(scan, JobOptions(seed=seed)) for seed in range(3)]
+        service.start_worker("stepping")
+        jobs = [client.submit(scan, JobOptions(seed=seed, steps=30)) for seed in range(3)]
+        (gib,) = wait_for_classes(service)
         with Redis(port=service.redis_port) as redis:
-            wait_until(lambda: redis.llen("rq:queue:advtex") == 3)
+            wait_until(lambda: service.store.queue.waiting_ids(gib))
             redis.flushall()
-        service.start_worker("quick")
         for job in jobs:
             assert client.wait_for_job(job.id, timeout=30).state is JobState.succeeded
 

@@ -13,15 +13,21 @@ import redis
 
 from advtex_contract.jobs import JobSpec
 from advtex_server.dispatch import Dispatcher
+from advtex_server.service import IN_LINE, job_view
 from advtex_server.settings import ServerSettings
 from advtex_store import keys
 from advtex_store.database import upgrade_database
+from advtex_store.queue import PRESENCE, queue_name
 from advtex_store.store import Store, open_store
+
+GIB = 8  # the class of the workers that there are unless a test says otherwise
 
 
 @pytest.fixture
 def store(database_url: str, redis_url: str, tmp_path: Path) -> Any:
     opened = open_store(ServerSettings(database_url=database_url, redis_url=redis_url, data_dir=tmp_path))
+    for number in range(8):
+        opened.queue.announce(f"worker-{number}", GIB)
     yield opened
     opened.close()
 
@@ -31,14 +37,27 @@ def settings(store: Store, **values: Any) -> ServerSettings:
     return store.settings.model_copy(update=values)
 
 
-def submit(store: Store) -> str:
-    upload = store.uploads.create("me", 3)
+def submit(store: Store, owner: str = "me", *, gib: int = 0, priority: int = 0) -> str:
+    upload = store.uploads.create(owner, 3)
     store.uploads.finish(upload.id, "ab" * 32)
-    return store.submissions.create_job("me", JobSpec(upload_id=upload.id)).id
+    spec = JobSpec(upload_id=upload.id, priority=priority)
+    return store.submissions.create_job(owner, spec, memory_bytes=gib << 30).id
 
 
-def in_redis(store: Store) -> list[str]:
-    return list(store.queue.rq.job_ids)
+def only_workers(store: Store, *classes: int) -> None:
+    """These and no others."""
+    for key in store.queue.redis.keys(PRESENCE + "*"):
+        store.queue.redis.delete(key)
+    for number, gib in enumerate(classes):
+        store.queue.announce(f"only-{number}", gib)
+
+
+def in_redis(store: Store, gib: int = GIB) -> list[str]:
+    return store.queue.waiting_ids(gib)
+
+
+def reason(store: Store, job: str) -> str:
+    return job_view(store.records.job(job)).waiting_reason
 
 
 def test_rows_are_offered_once_oldest_first(store: Store) -> None:
@@ -51,16 +70,19 @@ def test_rows_are_offered_once_oldest_first(store: Store) -> None:
 
 def test_redis_stays_shallow(store: Store) -> None:
     jobs = [submit(store) for _ in range(5)]
-    dispatcher = Dispatcher(store, settings(store, queue_depth=2))
+    only_workers(store, GIB, GIB)
+    dispatcher = Dispatcher(store, settings(store))
     dispatcher.dispatch()
     assert in_redis(store) == [f"{job}-1" for job in jobs[:2]]
+    store.queue.redis.lpop(f"rq:queue:{queue_name(GIB)}")
     store.records.claim(jobs[0], 1, "w")
     dispatcher.dispatch()
-    assert in_redis(store)[-1] == f"{jobs[2]}-1"
+    assert in_redis(store) == [f"{job}-1" for job in jobs[1:3]]
 
 
 def test_many_servers_dispatch_at_once(store: Store) -> None:
     jobs = [submit(store) for _ in range(8)]
+    only_workers(store, *[GIB] * 20)
     dispatchers = [Dispatcher(store, settings(store)) for _ in range(4)]
     threads = [threading.Thread(target=d.dispatch) for d in dispatchers]
     threads += [threading.Thread(target=d.reconcile) for d in dispatchers]
@@ -76,6 +98,7 @@ def test_an_emptied_redis_costs_nothing(store: Store) -> None:
     dispatcher = Dispatcher(store, settings(store))
     dispatcher.dispatch()
     store.queue.redis.flushall()
+    only_workers(store, GIB)
     dispatcher.dispatch()
     assert in_redis(store) == [f"{job}-1"]
 
@@ -88,6 +111,81 @@ def test_a_preempted_job_is_next(store: Store) -> None:
     store.records.preempt(second, 1)
     dispatcher.dispatch()
     assert in_redis(store)[:2] == [f"{second}-2", f"{first}-1"]
+
+
+def test_a_preempted_job_is_next_even_if_no_place_is_free(store: Store) -> None:
+    only_workers(store, GIB)
+    first, second = submit(store), submit(store)
+    store.records.claim(second, 1, "w")
+    dispatcher = Dispatcher(store, settings(store))
+    dispatcher.dispatch()
+    store.records.preempt(second, 1)
+    dispatcher.dispatch()
+    assert in_redis(store) == [f"{second}-2", f"{first}-1"]
+
+
+def test_owners_take_turns_and_their_priorities_are_their_own(store: Store) -> None:
+    many = [submit(store, "many", priority=priority) for priority in (0, 0, 5, 100)]
+    few = [submit(store, "few") for _ in range(2)]
+    Dispatcher(store, settings(store)).dispatch()
+    expected = [many[3], few[0], many[2], few[1], many[0], many[1]]
+    assert in_redis(store) == [f"{job}-1" for job in expected]
+
+
+def test_who_has_jobs_running_waits_for_those_who_have_none(store: Store) -> None:
+    only_workers(store, GIB, GIB)
+    running = [submit(store, "many") for _ in range(3)]
+    for job in running:
+        store.records.claim(job, 1, "w")
+    waits, newcomer = submit(store, "many"), submit(store, "new")
+    Dispatcher(store, settings(store)).dispatch()
+    assert in_redis(store) == [f"{newcomer}-1", f"{waits}-1"]
+
+
+def test_a_job_goes_to_the_smallest_worker_that_it_fits(store: Store) -> None:
+    only_workers(store, 8, 24)
+    large, small, other = submit(store, gib=20), submit(store, gib=2), submit(store, gib=8)
+    Dispatcher(store, settings(store)).dispatch()
+    assert in_redis(store, 8) == [f"{small}-1"]
+    assert in_redis(store, 24) == [f"{large}-1"]
+    assert reason(store, other) == IN_LINE
+
+
+def test_large_workers_take_small_jobs_when_nothing_else_waits(store: Store) -> None:
+    only_workers(store, 8, 24)
+    jobs = [submit(store, gib=2) for _ in range(2)]
+    Dispatcher(store, settings(store)).dispatch()
+    assert (in_redis(store, 8), in_redis(store, 24)) == ([f"{jobs[0]}-1"], [f"{jobs[1]}-1"])
+
+
+def test_what_fits_nowhere_waits_with_a_reason_and_holds_up_nobody(store: Store) -> None:
+    only_workers(store, 8)
+    huge, small = submit(store, gib=30), submit(store, gib=2)
+    dispatcher = Dispatcher(store, settings(store))
+    dispatcher.dispatch()
+    assert in_redis(store, 8) == [f"{small}-1"]
+    assert "more memory than the 8 GiB of the largest worker" in reason(store, huge)
+    version = store.records.job(huge).version
+    dispatcher.dispatch()
+    assert store.records.job(huge).version == version, "the same reason is no news"
+    only_workers(store, 8, 32)
+    dispatcher.dispatch()
+    assert in_redis(store, 32) == [f"{huge}-1"]
+    assert reason(store, huge) == IN_LINE
+    store.records.claim(huge, 1, "w")
+    assert reason(store, huge) == ""
+
+
+def test_without_workers_nothing_is_offered_and_what_was_is_taken_back(store: Store) -> None:
+    job = submit(store)
+    dispatcher = Dispatcher(store, settings(store))
+    dispatcher.dispatch()
+    only_workers(store)
+    assert dispatcher.dispatch() == 0
+    assert in_redis(store) == []
+    assert "no worker is running" in reason(store, job)
+    only_workers(store, 16)
+    assert dispatcher.dispatch() == 1
 
 
 def test_an_expired_lease_becomes_the_next_attempt(store: Store) -> None:
@@ -146,13 +244,16 @@ def test_jobs_are_accepted_while_redis_is_away_and_start_when_it_is_back(
             pause.wait(0.02)
         pytest.fail("not in time")
 
+    only_workers(live.store, GIB, GIB)
     upload = live.upload(scan_zip.read_bytes())
     first = live.job(upload)["id"]
     until(lambda: in_redis(live.store) == [f"{first}-1"])
     own_redis.stop()
     second = live.job(upload)["id"]
     assert live.http.get("/readyz").json()["checks"]["redis"]["ok"] is False
+    until(lambda: "Redis" in live.http.get(f"/v1/jobs/{second}").json()["waiting_reason"])
     own_redis.start()  # empty: what was in it is gone
+    only_workers(live.store, GIB, GIB)
     until(lambda: in_redis(live.store) == [f"{first}-1", f"{second}-1"])
 
 

@@ -6,6 +6,7 @@ import argparse
 import logging
 import os
 import signal
+import socket
 import sys
 import threading
 from types import FrameType
@@ -18,27 +19,54 @@ from rq import Worker
 from rq.exceptions import StopRequested
 from rq.serializers import JSONSerializer
 
-from advtex_store.queue import QUEUE, connect_redis
+from advtex_store.queue import JobQueue, class_of, connect_redis, queue_name
+from advtex_worker.memory import usable_memory
 from advtex_worker.parentage import die_with_parent
 from advtex_worker.settings import WorkerSettings
 from advtex_worker.tasks import Host, serve_as
 
-RECONNECT_SECONDS = 2.0
+RECONNECT_SECONDS = 2
+HEARTBEAT_SECONDS = 5  # between signs of life in Redis
+RQ_WAIT_MARGIN = 15  # RQ waits so much shorter for a job than its worker's time to live
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 log = structlog.get_logger()
 
 
 class JobWorker(Worker):
-    """RQ's worker with three changes: it hands stop signals on to its work-horse instead of waiting for it or killing
-    it, its work-horse does not outlive it, and losing Redis in the middle of a job changes nothing.
+    """RQ's worker with four changes: it hands stop signals on to its work-horse instead of waiting for it or killing
+    it, its work-horse does not outlive it, losing Redis in the middle of a job changes nothing, and it announces itself
+    with what it can take.
     """
 
-    def __init__(self, host: Host, connection: Any, stopping: threading.Event) -> None:
-        super().__init__([QUEUE], connection=connection, serializer=JSONSerializer)
+    max_connection_wait_time = RECONNECT_SECONDS
+
+    def __init__(self, host: Host, connection: Any, stopping: threading.Event, gib: int) -> None:
         self._host = host
         self._stopping = stopping
+        self._gib = gib
         self._parent_pid = os.getpid()
+        self._presence = JobQueue(connection)
+        self._known_as = f"{socket.gethostname()}-{self._parent_pid}"
+        super().__init__(
+            [queue_name(gib)],
+            connection=connection,
+            serializer=JSONSerializer,
+            worker_ttl=HEARTBEAT_SECONDS + RQ_WAIT_MARGIN,
+            job_monitoring_interval=HEARTBEAT_SECONDS,
+        )
+
+    def register_birth(self) -> None:
+        super().register_birth()  # type: ignore[no-untyped-call]
+        self._presence.announce(self._known_as, self._gib)
+
+    def heartbeat(self, timeout: int | None = None, pipeline: Any = None) -> None:
+        super().heartbeat(timeout, pipeline)
+        self._presence.announce(self._known_as, self._gib, pipeline)
+
+    def register_death(self) -> None:
+        self._presence.depart(self._known_as)
+        super().register_death()  # type: ignore[no-untyped-call]
 
     def request_stop(self, _signum: int, _frame: FrameType | None) -> None:
         """The horse checkpoints and gives its job back; without one, the worker ends at once. May come repeatedly."""
@@ -80,9 +108,11 @@ class JobWorker(Worker):
 def work(host: Host) -> None:
     """Serve the queue until SIGTERM or SIGINT; a Redis that is away is waited for."""
     stopping = threading.Event()
+    gib = class_of(host.settings.memory_bytes or usable_memory(host.settings.device))
+    log.info("worker takes jobs", memory_gib=gib)
     while not stopping.is_set():
         try:
-            JobWorker(host, connect_redis(host.settings), stopping).work(logging_level="WARNING")
+            JobWorker(host, connect_redis(host.settings), stopping, gib).work(logging_level="WARNING")
             if not stopping.is_set():
                 log.warning("the connection to Redis broke; connecting again")
         except RedisError as error:

@@ -27,7 +27,7 @@ class ProgressTracker:
             self.view = self.view.model_copy(update={"stage_seconds": spent})
             return
         self._first = None
-        self.view = self.view.model_copy(update={"stage": event.stage, "eta_seconds": None})
+        self.view = self.view.model_copy(update={"stage": event.stage, "steps_per_second": None, "eta_seconds": None})
         self._reach(event.stage, 0)
 
     def progress(self, event: ProgressEvent) -> None:
@@ -37,8 +37,14 @@ class ProgressTracker:
             self._first = (event.step, now)
         first_step, since = self._first
         done = event.step - first_step
-        eta = (event.steps - event.step) * (now - since) / done if done > 0 else None
-        update = {"step": event.step, "steps": event.steps, "losses": event.losses, "eta_seconds": eta}
+        rate = done / (now - since) if done > 0 and now > since else None
+        update = {
+            "step": event.step,
+            "steps": event.steps,
+            "losses": event.losses,
+            "steps_per_second": rate,
+            "eta_seconds": (event.steps - event.step) / rate if rate else None,
+        }
         self.view = self.view.model_copy(update=update)
         self._reach(self.view.stage, event.step)
 

@@ -17,6 +17,7 @@ class WorkerSettings(StoreSettings):
     """
 
     device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="where the engine computes")
+    memory_bytes: int | None = Field(default=None, gt=0, description="what a job may use; the device's by default")
     work_dir: Path | None = None
     threads: int = Field(default_factory=lambda: len(os.sched_getaffinity(0)), ge=1, description="of the engine")
     grace_seconds: float = Field(default=30.0, gt=0, description="a runner that was asked to stop is killed after this")

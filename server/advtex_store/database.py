@@ -14,6 +14,9 @@ from sqlalchemy import Connection, Engine, create_engine, event, text
 from sqlalchemy.engine import make_url
 from sqlalchemy.orm import Session
 
+# A cut line is noticed in seconds, and what it left open is given up: rows that it had locked would block everybody.
+POSTGRES_LINE = {"connect_timeout": 5, "tcp_user_timeout": 10_000, "keepalives_idle": 10, "keepalives_interval": 5}
+POSTGRES_LIMITS = "-c statement_timeout=30s -c lock_timeout=15s -c idle_in_transaction_session_timeout=20s"
 MIGRATION_LOCK = 0x61647674  # any constant that only this service uses as a PostgreSQL advisory lock
 
 
@@ -25,7 +28,7 @@ class Database:
     """
 
     def __init__(self, url: str, clock: Callable[[], float] | None = None) -> None:
-        self.engine = connect(url)
+        self.engine = connect(url, POSTGRES_LIMITS)
         self._clock = clock
 
     @contextmanager
@@ -58,10 +61,11 @@ class Database:
         self.engine.dispose()
 
 
-def connect(url: str) -> Engine:
-    """An engine with the settings that durability needs."""
+def connect(url: str, limits: str = "") -> Engine:
+    """An engine with the settings that durability needs. `limits` are PostgreSQL's, as `-c name=value`."""
     if make_url(url).get_backend_name() != "sqlite":
-        return create_engine(url, pool_pre_ping=True, pool_size=10, max_overflow=20)
+        arguments = {**POSTGRES_LINE, "options": limits}
+        return create_engine(url, pool_pre_ping=True, pool_size=10, max_overflow=20, connect_args=arguments)
     if folder := make_url(url).database:
         Path(folder).parent.mkdir(parents=True, exist_ok=True)
     engine = create_engine(url, connect_args={"timeout": 30})

@@ -7,11 +7,13 @@ import math
 import os
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import psutil
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -36,6 +38,7 @@ from advtex_worker.events import (
     parse_event,
 )
 from advtex_worker.lease import Ending, LeaseKeeper
+from advtex_worker.memory import usable_memory
 from advtex_worker.progress import ProgressTracker
 
 
@@ -188,16 +191,46 @@ def keeper(records: FakeRecords, endings: list[Ending], tail: str = "") -> Lease
     return LeaseKeeper(records, "job", 1, interval=60.0, on_ending=endings.append, log_tail=lambda: tail)  # type: ignore[arg-type]
 
 
-def test_a_database_that_is_away_costs_nothing_until_the_lease_has_run_out() -> None:
-    records, endings = FakeRecords(), []
-    kept = keeper(records, endings)
-    assert kept.beat()
+def test_a_database_that_is_away_costs_nothing_until_the_lease_runs_out() -> None:
+    records, ended = FakeRecords(), threading.Event()
+    records.lease_seconds = 0.5
+    kept = LeaseKeeper(records, "job", 1, interval=0.01, on_ending=lambda _: ended.set(), log_tail=lambda: "")  # type: ignore[arg-type]
+    began = time.monotonic()
+    kept.start()
+    assert not ended.wait(2 * records.lease_seconds), "the heartbeats renew it"
     records.answer = ConnectionError("no route")
     assert kept.beat()
-    assert endings == []
-    time.sleep(0.25)
-    assert not kept.beat()
-    assert endings == [Ending.lost]
+    assert ended.wait(5.0)
+    assert kept.ending is Ending.lost
+    assert time.monotonic() - began < 8 * records.lease_seconds
+    kept.stop()
+
+
+def test_a_heartbeat_that_hangs_does_not_hide_the_end_of_the_lease() -> None:
+    records, ended, hung = FakeRecords(), threading.Event(), threading.Event()
+
+    def hang(*_: Any, **__: Any) -> Lease:
+        hung.wait(20)
+        return Lease(math.inf, False)
+
+    records.heartbeat = hang  # type: ignore[method-assign]
+    kept = LeaseKeeper(records, "job", 1, interval=0.01, on_ending=lambda _: ended.set(), log_tail=lambda: "")  # type: ignore[arg-type]
+    kept.start()
+    assert ended.wait(5.0)
+    hung.set()
+    kept.stop()
+
+
+def test_memory_is_the_smallest_gpus_or_the_machines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tool = tmp_path / "nvidia-smi"
+    tool.write_text("#!/bin/sh\necho 24564\necho 8192\n")
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    assert usable_memory("auto") == usable_memory("cuda:1") == 8192 << 20
+    machine = usable_memory("cpu")
+    assert 0 < machine <= psutil.virtual_memory().total
+    tool.write_text("#!/bin/sh\nexit 9\n")
+    assert usable_memory("auto") == machine
 
 
 def test_a_stale_attempt_is_told_once_and_overrules_a_cancel() -> None:

@@ -142,23 +142,31 @@ class Attempt:
         """Do the work and record how it ended. A lost lease ends it without a word: the job is another attempt's."""
         self._keeper.start()
         try:
-            if not self._persist(lambda: self._store.results.adopt(self._job_id)):
-                with ExitStack() as stack:
-                    self._persist(lambda: stack.enter_context(self._space.made()))
-                    self._run()
-        except Interrupted:
-            self._give_back()
+            self._run_or_give_back()
         except StaleAttempt as error:
             self._log.warning("attempt is stale", reason=str(error))
+        except Interrupted:
+            self._log.warning("the lease was lost before the end could be recorded")
         finally:
             self._keeper.stop()
+
+    def _run_or_give_back(self) -> None:
+        try:
+            if self._persist(lambda: self._store.results.adopt(self._job_id)):
+                return
+            with ExitStack() as stack:
+                self._persist(lambda: stack.enter_context(self._space.made()))
+                self._run()
+        except Interrupted:
+            self._give_back()
 
     def _run(self) -> None:
         try:
             self._persist(self._fetch_scan)
         except BlobNotFound:
             message = "the scan is no longer stored; submit it again"
-            self._store.records.fail(self._job_id, self._number, JobError(code="scan_missing", message=message))
+            error = JobError(code="scan_missing", message=message)
+            self._record(lambda: self._store.records.fail(self._job_id, self._number, error))
             return
         base = self._persist(lambda: restore(self._store.blobs, self._job_id, self._number, self._space.work))
         self._warnings = base.warnings
@@ -235,24 +243,26 @@ class Attempt:
             with suppress(Exception):  # they are only worth their space now; deleting the job removes them too
                 self._store.blobs.delete_prefix(keys.checkpoints_prefix(job_id))
         elif isinstance(ended, FailedEvent) and ended.code == "invalid_scan":
-            error = JobError(code=ended.code, message=ended.message, details=ended.details)
-            records.reject(job_id, number, error)
+            rejection = JobError(code=ended.code, message=ended.message, details=ended.details)
+            self._record(lambda: records.reject(job_id, number, rejection))
         elif isinstance(ended, FailedEvent):
             error = JobError(code=ended.code, message=ended.message, details=ended.details, log_tail=tail)
-            records.fail(job_id, number, error)
+            self._record(lambda: records.fail(job_id, number, error))
         elif self._keeper.ending or isinstance(ended, StoppedEvent):
             self._give_back()
         else:
             sentence = death_sentence(code)
-            state = records.lost(job_id, number, log_tail=f"{tail.rstrip()}\n{sentence}\n".lstrip())
+            told = f"{tail.rstrip()}\n{sentence}\n".lstrip()
+            state = self._record(lambda: records.lost(job_id, number, log_tail=told))
             self._log.warning("runner died", reason=sentence, job_is=state)
 
     def _give_back(self) -> None:
         """After a cancel or a SIGTERM, also one that only the runner got, with whatever checkpoint there is."""
+        records, job_id, number = self._store.records, self._job_id, self._number
         if self._keeper.ending is Ending.cancel:
-            self._store.records.canceled(self._job_id, self._number)
+            self._record(lambda: records.canceled(job_id, number))
         elif self._keeper.ending is not Ending.lost:
-            self._store.records.preempt(self._job_id, self._number)
+            self._record(lambda: records.preempt(job_id, number))
 
     def _on_ending(self, ending: Ending) -> None:
         child = self._child
@@ -269,6 +279,16 @@ class Attempt:
 
     def _log_tail(self) -> str:
         return self._child.log_tail() if self._child else ""
+
+    def _record(self, action: Callable[[], T]) -> T:
+        """Tell the rows how it ended, again until they answer or the lease is lost (Interrupted)."""
+        while self._keeper.ending is not Ending.lost:
+            try:
+                return action()
+            except SQLAlchemyError as error:
+                self._log.warning("the end cannot be recorded, trying again", error=str(error))
+            time.sleep(0.5)
+        raise Interrupted
 
     def _persist(self, action: Callable[[], T]) -> T:
         """Try until the storage plays along: a full disk or an unreachable bucket pauses the work and loses nothing."""

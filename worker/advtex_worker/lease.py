@@ -13,6 +13,9 @@ from advtex_contract.jobs import Progress
 from advtex_store.errors import StaleAttempt
 from advtex_store.records import Records
 
+HELD_SHARE = 0.9  # of the lease; then the run is ended, so that it is over before another one may begin
+WATCH_SECONDS = 1.0
+
 log = structlog.get_logger()
 
 
@@ -27,8 +30,8 @@ class Ending(StrEnum):
 class LeaseKeeper:
     """Renews the lease with the newest progress, and finds out that the user or the server wants the run ended.
 
-    A database that cannot be reached is no loss until the lease must have run out. `on_ending` is called from this
-    thread, once per reason.
+    A database that cannot be reached is no loss until the lease is about to run out; a second thread watches that,
+    since a heartbeat may hang. `on_ending` is called from these threads, once per reason.
     """
 
     def __init__(
@@ -49,20 +52,25 @@ class LeaseKeeper:
         self._log_tail = log_tail
         self._told_tail = ""
         self._progress: tuple[Progress | None, int] = (None, 0)
-        self._good = time.monotonic()
+        self._held_until = self._until()
         self._done = threading.Event()
         self._beating = threading.Lock()
         self._deciding = threading.Lock()
         self.ending: Ending | None = None
-        self._thread = threading.Thread(target=self._work, name="lease", daemon=True)
+        self._threads = [
+            threading.Thread(target=self._work, name="lease", daemon=True),
+            threading.Thread(target=self._watch, name="lease watch", daemon=True),
+        ]
 
     def start(self) -> None:
-        self._thread.start()
+        for thread in self._threads:
+            thread.start()
 
     def stop(self) -> None:
-        """End the thread; the lease is no longer renewed."""
+        """End the threads; the lease is no longer renewed."""
         self._done.set()
-        self._thread.join()
+        for thread in self._threads:
+            thread.join()
 
     def report(self, progress: Progress, reached: int) -> None:
         """What the next heartbeat tells."""
@@ -83,6 +91,7 @@ class LeaseKeeper:
             progress, reached = self._progress
             tail = self._log_tail()
             news = tail if tail != self._told_tail else None
+            until = self._until()  # taken before it is asked for: the rows' lease ends later than this
             try:
                 lease = self._records.heartbeat(self._job_id, self._attempt, progress, reached=reached, log_tail=news)
             except StaleAttempt as error:
@@ -91,10 +100,8 @@ class LeaseKeeper:
                 return False
             except Exception as error:  # whatever the database driver calls its being away
                 log.warning("heartbeat failed", job=self._job_id, attempt=self._attempt, error=str(error))
-                if time.monotonic() - self._good > self._records.lease_seconds:
-                    self.end(Ending.lost)
                 return self.ending is not Ending.lost
-            self._good, self._told_tail = time.monotonic(), tail
+            self._held_until, self._told_tail = until, tail
             if lease.cancel_requested:
                 self.end(Ending.cancel)
             return True
@@ -102,3 +109,18 @@ class LeaseKeeper:
     def _work(self) -> None:
         while not self._done.wait(self._interval):
             self.beat()
+
+    def _watch(self) -> None:
+        while (left := self._held_until - _now()) > 0:
+            if self._done.wait(min(left, WATCH_SECONDS)):
+                return
+        log.warning("no heartbeat got through in time", job=self._job_id, attempt=self._attempt)
+        self.end(Ending.lost)
+
+    def _until(self) -> float:
+        return _now() + self._records.lease_seconds * HELD_SHARE
+
+
+def _now() -> float:
+    """Seconds that go on while the machine is suspended: leases do not wait for it."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)

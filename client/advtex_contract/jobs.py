@@ -137,6 +137,14 @@ class UploadView(BaseModel):
     expires_at: datetime | None = None
 
 
+class UploadList(BaseModel):
+    """Uploads that have the same bytes, the most useful one first."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    uploads: list[UploadView]
+
+
 class StorageInfo(BaseModel):
     """What the server accepts at most, and how long it keeps things (seconds)."""
 

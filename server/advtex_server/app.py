@@ -12,11 +12,14 @@ from fastapi import FastAPI
 from advtex_contract.errors import ErrorBody
 from advtex_server import errors
 from advtex_server.access import AccessMiddleware
+from advtex_server.bodies import OpenBodies
 from advtex_server.dispatch import Dispatcher
+from advtex_server.intake import Intake
 from advtex_server.metrics import Metrics, MetricsMiddleware
 from advtex_server.routes import health, jobs, uploads
 from advtex_server.service import Service
 from advtex_server.settings import ServerSettings
+from advtex_server.tus import TusMiddleware
 from advtex_store.database import upgrade_database
 from advtex_store.store import open_store
 
@@ -56,8 +59,11 @@ def create_app(settings: ServerSettings) -> FastAPI:
     app.state.service = Service(store, settings, dispatcher.wake)
     app.state.metrics = metrics
     app.state.stopping = asyncio.Event()
+    app.state.intake = Intake(store, settings)
+    app.state.bodies = OpenBodies()
     errors.install(app)
     app.add_middleware(AccessMiddleware, accounts=store.accounts, max_body_bytes=settings.max_body_bytes)
+    app.add_middleware(TusMiddleware)
     app.add_middleware(MetricsMiddleware, metrics=metrics)
     for module in (uploads, jobs, health):
         app.include_router(module.router)

@@ -8,6 +8,7 @@ from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from advtex_contract.errors import ErrorCode
+from advtex_server.intake import Intake
 from advtex_server.refusal import ApiError
 from advtex_server.service import Service
 from advtex_store.accounts import Caller
@@ -19,6 +20,10 @@ _Key = Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
 
 def _service(request: Request) -> Service:
     return cast(Service, request.app.state.service)
+
+
+def _intake(request: Request) -> Intake:
+    return cast(Intake, request.app.state.intake)
 
 
 def reader(request: Request, _key: _Key) -> Caller:
@@ -40,4 +45,5 @@ def _with_scope(request: Request, scope: str) -> Caller:
 
 Reader = Annotated[Caller, Depends(reader)]
 Writer = Annotated[Caller, Depends(writer)]
+TheIntake = Annotated[Intake, Depends(_intake)]
 TheService = Annotated[Service, Depends(_service)]

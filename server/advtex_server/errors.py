@@ -23,6 +23,7 @@ STORE_CODES: Mapping[type[store.StoreError], ErrorCode] = {
     store.BlobNotFound: ErrorCode.not_found,
     store.IllegalTransition: ErrorCode.conflict,
     store.StaleAttempt: ErrorCode.conflict,
+    store.Superseded: ErrorCode.conflict,
     store.IdempotencyMismatch: ErrorCode.idempotency_mismatch,
     store.IdempotencyInFlight: ErrorCode.idempotency_in_flight,
     store.NoSpace: ErrorCode.insufficient_storage,

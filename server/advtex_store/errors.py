@@ -4,6 +4,7 @@ StoreError
 ├── RecordNotFound        no such object, or it belongs to somebody else
 ├── IllegalTransition     the job's state does not allow it
 ├── StaleAttempt          the attempt is no longer the job's current one: stop, write nothing more
+├── Superseded            a newer request has the upload now, or it was deleted
 ├── IdempotencyMismatch   the same key came with another body
 ├── IdempotencyInFlight   the same key is being worked on right now
 ├── QuotaExceeded         the owner has as much as the key allows
@@ -29,6 +30,10 @@ class IllegalTransition(StoreError):
 
 class StaleAttempt(StoreError):
     """The attempt lost its job to a later one, or the job has ended: stop, and write nothing more."""
+
+
+class Superseded(StoreError):
+    """A newer request goes on with the upload."""
 
 
 class IdempotencyMismatch(StoreError):

@@ -54,6 +54,7 @@ class Retention:
             self.blobs.delete_prefix(keys.job_prefix(job_id))
             self._done(JobRow, job_id)
         for upload_id in uploads:
+            self.blobs.drop_partial(keys.scan_key(upload_id))
             self.blobs.delete_prefix(keys.scan_prefix(upload_id))
             self._done(UploadRow, upload_id)
         return len(jobs) + len(uploads)

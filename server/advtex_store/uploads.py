@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from sqlalchemy import exists, select, update
+import secrets
+from collections.abc import Callable
+
+from sqlalchemy import ColumnElement, and_, exists, func, select, update
 
 from advtex_store.database import Database
-from advtex_store.errors import IllegalTransition, RecordNotFound
+from advtex_store.errors import IllegalTransition, QuotaExceeded, RecordNotFound, Superseded
 from advtex_store.ids import new_id
-from advtex_store.models import JobRow, UploadRow
+from advtex_store.models import ApiKeyRow, JobRow, UploadRow
 
-INCOMPLETE_SECONDS = 86400.0  # an upload that is not finished by then is forgotten
+INCOMPLETE_SECONDS = 86400.0  # an upload is forgotten this long after its last bytes
+FOUND = 20  # of the uploads with the same bytes, the most useful ones
 
 
 class Uploads:
@@ -19,9 +23,34 @@ class Uploads:
         self.database = database
         self.retention_seconds = retention_seconds
 
-    def create(self, owner: str, size: int, filename: str = "") -> UploadRow:
-        """A row for `size` bytes to come."""
+    def create(
+        self,
+        owner: str,
+        size: int,
+        filename: str = "",
+        *,
+        announced_sha256: str | None = None,
+        tus_metadata: str = "",
+        max_bytes: int | None = None,
+        admit: Callable[[int], None] = lambda _: None,
+    ) -> UploadRow:
+        """A row for `size` bytes to come. QuotaExceeded: the owner would then have more than `max_bytes`.
+
+        admit: called with the bytes that unfinished uploads still expect, all owners' together; refuses by raising.
+        """
         with self.database.write() as session:
+            # The owner's keys are locked, so that two requests at once cannot both take the last bytes.
+            session.scalars(select(ApiKeyRow.id).where(ApiKeyRow.owner == owner).with_for_update()).all()
+            held = session.scalar(
+                select(func.sum(UploadRow.size)).where(UploadRow.owner == owner, UploadRow.deleted_at.is_(None))
+            )
+            if max_bytes is not None and int(held or 0) + size > max_bytes:
+                raise QuotaExceeded(
+                    f"uploads of {int(held or 0)} bytes are kept and this key may have {max_bytes}, "
+                    f"so {size} more do not fit: delete jobs and uploads that are no longer needed"
+                )
+            expected = session.scalar(select(func.sum(UploadRow.size - UploadRow.offset)).where(_unfinished()))
+            admit(int(expected or 0))
             now = self.database.now(session)
             row = UploadRow(
                 id=new_id(now),
@@ -29,6 +58,8 @@ class Uploads:
                 size=size,
                 offset=0,
                 filename=filename[:255],
+                announced_sha256=announced_sha256,
+                tus_metadata=tus_metadata,
                 created_at=now,
                 expires_at=now + INCOMPLETE_SECONDS,
             )
@@ -46,10 +77,44 @@ class Uploads:
                 raise RecordNotFound(f"there is no upload {upload_id}")
             return row
 
-    def advance(self, upload_id: str, offset: int) -> None:
-        """The first `offset` bytes are on disk."""
+    def find(self, owner: str, sha256: str) -> list[UploadRow]:
+        """Uploads that have these bytes, or are to have them: complete ones first, then those that came farthest."""
+        with self.database.read() as session:
+            query = (
+                select(UploadRow)
+                .where(UploadRow.owner == owner, UploadRow.announced_sha256 == sha256, UploadRow.deleted_at.is_(None))
+                .where(UploadRow.expires_at > self.database.now(session))
+                .order_by(UploadRow.sha256.is_(None), UploadRow.offset.desc(), UploadRow.id)
+            )
+            return list(session.scalars(query.limit(FOUND)))
+
+    def seize(self, upload_id: str, owner: str) -> UploadRow:
+        """Take an unfinished upload over from whichever request has it. RecordNotFound."""
         with self.database.write() as session:
-            session.execute(update(UploadRow).where(UploadRow.id == upload_id).values(offset=offset))
+            row: UploadRow | None = session.scalar(
+                update(UploadRow)
+                .where(UploadRow.id == upload_id, UploadRow.owner == owner, _unfinished())
+                .values(holder=secrets.token_hex(8))
+                .returning(UploadRow),
+                execution_options={"populate_existing": True, "synchronize_session": False},
+            )
+            if row is None:
+                raise RecordNotFound(f"there is no unfinished upload {upload_id}")
+            return row
+
+    def advance(self, upload_id: str, holder: str, offset: int) -> float:
+        """The first `offset` bytes are durable. -> when the upload expires. Superseded: another request has it now."""
+        with self.database.write() as session:
+            expires_at = self.database.now(session) + INCOMPLETE_SECONDS
+            advanced = session.scalar(
+                update(UploadRow)
+                .where(UploadRow.id == upload_id, UploadRow.holder == holder, _unfinished())
+                .values(offset=offset, expires_at=expires_at)
+                .returning(UploadRow.id)
+            )
+            if advanced is None:
+                raise Superseded(f"a newer request goes on with upload {upload_id}, or it was deleted")
+            return expires_at
 
     def finish(self, upload_id: str, sha256: str) -> UploadRow:
         """The blob is durable. Finishing again with the same sha256 changes nothing."""
@@ -57,11 +122,19 @@ class Uploads:
             row = session.scalar(select(UploadRow).where(UploadRow.id == upload_id).with_for_update())
             if row is None or row.deleted_at is not None:
                 raise RecordNotFound(f"there is no upload {upload_id}")
-            if row.sha256 not in (None, sha256):
+            if row.sha256 == sha256:
+                return row
+            if row.sha256 is not None:
                 raise IllegalTransition(f"upload {upload_id} is complete with other bytes")
-            row.sha256, row.offset = sha256, row.size
+            row.sha256, row.announced_sha256, row.offset, row.holder = sha256, sha256, row.size, None
             row.expires_at = self.database.now(session) + self.retention_seconds
             return row
+
+    def expected_bytes(self) -> int:
+        """What unfinished uploads still wait for: room that is promised."""
+        with self.database.read() as session:
+            query = select(func.sum(UploadRow.size - UploadRow.offset)).where(_unfinished())
+            return int(session.scalar(query) or 0)
 
     def discard(self, upload_id: str) -> None:
         """Forget an upload that was cut off; nothing of it is kept."""
@@ -82,3 +155,7 @@ class Uploads:
             if session.scalar(select(exists().where(JobRow.upload_id == upload_id, JobRow.deleted_at.is_(None)))):
                 raise IllegalTransition(f"upload {upload_id} belongs to a job: delete the job first")
             row.deleted_at = self.database.now(session)
+
+
+def _unfinished() -> ColumnElement[bool]:
+    return and_(UploadRow.sha256.is_(None), UploadRow.source.is_(None), UploadRow.deleted_at.is_(None))

@@ -7,14 +7,18 @@ from typing import Any
 import pytest
 from sqlalchemy import text
 
-from advtex_store.errors import IllegalTransition, RecordNotFound
+from advtex_store.errors import IllegalTransition, QuotaExceeded, RecordNotFound, Superseded
 
 
 def test_an_upload_from_beginning_to_end(bench: Any) -> None:
     row = bench.uploads.create("me", 10, "scan.zip")
-    bench.uploads.advance(row.id, 4)
+    holder = bench.uploads.seize(row.id, "me").holder
+    bench.clock.now += 100
+    assert bench.uploads.expected_bytes() == 10
+    assert bench.uploads.advance(row.id, holder, 4) == bench.clock.now + 86400, "it expires a day after its last bytes"
     half = bench.uploads.upload(row.id, "me")
     assert (half.offset, half.sha256, half.expires_at) == (4, None, bench.clock.now + 86400)
+    assert bench.uploads.expected_bytes() == 6
     bench.clock.now += 5
     whole = bench.uploads.finish(row.id, "ab" * 32)
     assert (whole.offset, whole.sha256, whole.expires_at) == (10, "ab" * 32, bench.clock.now + 1000)
@@ -23,6 +27,53 @@ def test_an_upload_from_beginning_to_end(bench: Any) -> None:
         bench.uploads.finish(row.id, "cd" * 32)
     with pytest.raises(RecordNotFound):
         bench.uploads.upload(row.id, "somebody else")
+
+
+def test_only_the_newest_holder_moves_the_offset(bench: Any) -> None:
+    row = bench.uploads.create("me", 10)
+    old, new = (bench.uploads.seize(row.id, "me").holder for _ in range(2))
+    with pytest.raises(Superseded):
+        bench.uploads.advance(row.id, old, 4)
+    bench.uploads.advance(row.id, new, 5)
+    with pytest.raises(RecordNotFound):
+        bench.uploads.seize(row.id, "somebody else")
+    bench.uploads.finish(row.id, "ab" * 32)
+    with pytest.raises(Superseded):
+        bench.uploads.advance(row.id, new, 6)
+    with pytest.raises(RecordNotFound):
+        bench.uploads.seize(row.id, "me")
+
+
+def test_the_quota_counts_what_is_kept_and_what_is_on_its_way(bench: Any) -> None:
+    bench.accounts.create_key(owner="me")
+    row = bench.uploads.create("me", 60, max_bytes=100)
+    bench.uploads.finish(row.id, "ab" * 32)
+    bench.uploads.create("me", 40, max_bytes=100)
+    bench.uploads.create("other", 40, max_bytes=100)
+    with pytest.raises(QuotaExceeded):
+        bench.uploads.create("me", 1, max_bytes=100)
+    bench.uploads.delete(row.id)
+    bench.uploads.create("me", 60, max_bytes=100)
+
+
+def test_an_upload_that_is_not_admitted_leaves_no_row(bench: Any) -> None:
+    def refuse(expected: int) -> None:
+        raise IllegalTransition(f"{expected} bytes are promised")
+
+    bench.uploads.create("me", 60)
+    with pytest.raises(IllegalTransition, match="60 bytes are promised"):
+        bench.uploads.create("other", 10, admit=refuse)
+    assert bench.uploads.expected_bytes() == 60
+
+
+def test_uploads_are_found_by_their_bytes(bench: Any) -> None:
+    waiting = bench.uploads.create("me", 10, announced_sha256="ab" * 32)
+    whole = bench.uploads.create("me", 10)
+    bench.uploads.finish(whole.id, "ab" * 32)
+    bench.uploads.create("other", 10, announced_sha256="ab" * 32)
+    assert [row.id for row in bench.uploads.find("me", "ab" * 32)] == [whole.id, waiting.id]
+    bench.clock.now += 86401
+    assert [row.id for row in bench.uploads.find("me", "ab" * 32)] == [], "an expired one is about to go"
 
 
 def test_a_discarded_upload_is_gone(bench: Any) -> None:

@@ -1,92 +1,168 @@
-"""Uploads: the body of one POST, streamed to the blob storage while it is hashed."""
+"""Uploads: resumable ones as tus 1.0.0 has them, or the body of one plain POST for small scans and curl."""
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import AsyncGenerator, AsyncIterator
 from typing import Annotated
-from urllib.parse import unquote
 
-from fastapi import APIRouter, Depends, Header, Request, Response
+from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
 
 from advtex_contract.errors import ErrorCode
-from advtex_contract.jobs import StorageInfo, UploadView
-from advtex_server.deps import Reader, TheService, Writer, reader
+from advtex_contract.jobs import StorageInfo, UploadList, UploadView
+from advtex_server import tus
+from advtex_server.bodies import OpenBodies, receive
+from advtex_server.deps import Reader, TheIntake, TheService, Writer, reader
+from advtex_server.intake import Checksum, Intake, upload_view
 from advtex_server.refusal import ApiError
-from advtex_server.service import announced_sha256
+from advtex_store.models import UploadRow
 
 router = APIRouter(prefix="/v1", tags=["uploads"])
 
-BUFFER = 1 << 20  # bytes handed to the disk at a time
+PATIENCE = 30.0  # seconds that a request waits for an older one of the same upload to be kept
+HEAD_PATIENCE = 0.3  # a client that asks where to go on has lost its line already
+
+UploadId = Annotated[str, Path(max_length=64)]
+TusVersion = Annotated[str | None, Header(description="1.0.0; without it this is a plain upload")]
+TusChecksum = Annotated[str | None, Header(description="tus: algorithm and base64 digest of this body")]
+BINARY = {"schema": {"type": "string", "format": "binary"}}
+
+
+def _headers(**described: str) -> dict[str, dict[str, object]]:
+    return {
+        name.replace("_", "-"): {"description": text, "schema": {"type": "string"}} for name, text in described.items()
+    }
+
+
+OFFSET = _headers(Upload_Offset="bytes that are durable", Upload_Expires="when an unfinished upload is forgotten")
+
+
+@router.options("/uploads", status_code=204, dependencies=[Depends(reader)], response_class=Response)
+async def upload_features(service: TheService) -> Response:
+    """What the server speaks (tus)."""
+    headers = {
+        "Tus-Version": tus.VERSION,
+        "Tus-Extension": tus.EXTENSIONS,
+        "Tus-Checksum-Algorithm": ",".join(tus.ALGORITHMS),
+        "Tus-Max-Size": str(service.settings.max_upload_bytes),
+        "Tus-Resumable": tus.VERSION,
+    }
+    return Response(status_code=204, headers=headers)
 
 
 @router.post(
     "/uploads",
     status_code=201,
     openapi_extra={
-        "requestBody": {
-            "required": True,
-            "content": {"application/zip": {"schema": {"type": "string", "format": "binary"}}},
-        }
+        "requestBody": {"required": False, "content": {"application/zip": BINARY, tus.OFFSET_STREAM: BINARY}}
     },
+    responses={201: {"headers": _headers(Location="the upload") | OFFSET}},
 )
 async def create_upload(
     request: Request,
+    response: Response,
     caller: Writer,
-    service: TheService,
+    intake: TheIntake,
+    tus_resumable: TusVersion = None,
+    upload_length: Annotated[str | None, Header(description="tus: bytes of the scan")] = None,
+    upload_metadata: Annotated[str, Header(description="tus: `filename` and `sha256` (hexadecimal) are used")] = "",
+    upload_checksum: TusChecksum = None,
     content_digest: Annotated[str | None, Header(description="RFC 9530, `sha-256=:base64:`")] = None,
     x_content_sha256: Annotated[str | None, Header(description="SHA-256 of the body, hexadecimal")] = None,
     x_filename: Annotated[str, Header(max_length=1000, description="percent-encoded")] = "",
 ) -> UploadView:
-    """Send a scan as a zip. The answer comes when its bytes are durable."""
-    length = request.headers.get("content-length", "")
-    if not (length.isascii() and length.isdigit()):
-        raise ApiError(ErrorCode.bad_request, "an upload needs a Content-Length", status=411)
-    sha256 = announced_sha256(content_digest, x_content_sha256)
-    filename = "".join(c for c in unquote(x_filename) if c.isprintable())
-    block = service.incoming(caller.owner, int(length), filename, sha256)
-    incoming = await run_in_threadpool(block.__enter__)
-    try:
-        buffer = bytearray()
-        async for chunk in _unless_silent(request.stream(), service.settings.idle_seconds):
-            buffer += chunk
-            if len(buffer) >= BUFFER:
-                await run_in_threadpool(incoming.write, bytes(buffer))
-                buffer.clear()
-        await run_in_threadpool(incoming.write, bytes(buffer))
-        view = await run_in_threadpool(incoming.finish)
-    except BaseException as error:
-        # Run inline: a canceled task could not wait for a thread, and the clean-up must not be skipped.
-        block.__exit__(type(error), error, error.__traceback__)
-        raise
-    await run_in_threadpool(block.__exit__, None, None, None)
+    """Send a scan as a zip. With `Tus-Resumable` this begins a resumable upload, which may be sent with it in part;
+    without, the body is the scan, and the answer comes when its bytes are durable."""
+    if tus_resumable is not None:
+        given = tus.parse_metadata(upload_metadata)
+        size = tus.whole_number("Upload-Length", upload_length)
+        sha256 = tus.announced_sha256(content_digest, given.get("sha256", x_content_sha256))
+        checksum = tus.parse_checksum(upload_checksum)
+        filename = tus.shown_name(given.get("filename", given.get("name", "")))
+        row = await run_in_threadpool(intake.create, caller, size, filename, sha256, upload_metadata)
+        view = await run_in_threadpool(intake.view, caller.owner, row.id)
+        if request.headers.get("content-type") == tus.OFFSET_STREAM:
+            view = await _receive(request, intake, row, checksum=checksum)
+    else:
+        length = request.headers.get("content-length", "")
+        if not (length.isascii() and length.isdigit()):
+            raise ApiError(ErrorCode.bad_request, "an upload needs a Content-Length", status=411)
+        sha256 = tus.announced_sha256(content_digest, x_content_sha256)
+        row = await run_in_threadpool(intake.create, caller, int(length), tus.decoded_name(x_filename), sha256)
+        view = await _receive_whole(request, intake, row)
+    response.headers["Location"] = f"/v1/uploads/{view.id}"
+    response.headers.update(_progress(view))
     return view
 
 
-async def _unless_silent(chunks: AsyncGenerator[bytes, None], seconds: float) -> AsyncIterator[bytes]:
-    """A half-open connection would hold its room on the disk for ever."""
-    while True:
-        try:
-            async with asyncio.timeout(seconds):
-                chunk = await anext(chunks, None)
-        except TimeoutError:
-            raise ApiError(ErrorCode.bad_request, f"nothing came for {seconds:g} s", status=408) from None
-        if chunk is None:
-            return
-        yield chunk
+@router.get("/uploads")
+def find_uploads(
+    caller: Reader,
+    intake: TheIntake,
+    sha256: Annotated[str, Query(pattern="^[0-9a-f]{64}$", description="of the whole scan, hexadecimal")],
+) -> UploadList:
+    """Your uploads of these bytes, whole ones first: what is held already need not be sent again."""
+    return UploadList(uploads=intake.find(caller.owner, sha256))
 
 
 @router.get("/uploads/{upload_id}")
-def get_upload(upload_id: str, caller: Reader, service: TheService) -> UploadView:
+def get_upload(upload_id: UploadId, caller: Reader, intake: TheIntake) -> UploadView:
     """An upload; complete once `sha256` is set."""
-    return service.upload(caller.owner, upload_id)
+    return intake.view(caller.owner, upload_id)
+
+
+@router.head(
+    "/uploads/{upload_id}", response_class=Response, responses={200: {"headers": OFFSET, "description": "its offset"}}
+)
+async def head_upload(
+    upload_id: UploadId, caller: Writer, intake: TheIntake, request: Request, tus_resumable: TusVersion = None
+) -> Response:
+    """Where to go on (tus). Ends the request that is still sending bytes for this upload, if there is one."""
+    if tus_resumable is None:
+        raise tus.unsupported_version(None)
+    await run_in_threadpool(intake.view, caller.owner, upload_id)
+    await _bodies(request).end(upload_id, HEAD_PATIENCE)
+    row = await run_in_threadpool(intake.offset, caller.owner, upload_id)
+    view = await run_in_threadpool(intake.view, caller.owner, upload_id)
+    headers = {"Upload-Length": str(row.size), "Cache-Control": "no-store", **_progress(view)}
+    if row.tus_metadata:
+        headers["Upload-Metadata"] = row.tus_metadata
+    return Response(headers=headers)
+
+
+@router.patch(
+    "/uploads/{upload_id}",
+    status_code=204,
+    response_class=Response,
+    openapi_extra={"requestBody": {"required": True, "content": {tus.OFFSET_STREAM: BINARY}}},
+    responses={204: {"headers": OFFSET, "description": "the bytes are durable"}},
+)
+async def patch_upload(
+    upload_id: UploadId,
+    caller: Writer,
+    intake: TheIntake,
+    request: Request,
+    tus_resumable: TusVersion = None,
+    upload_offset: Annotated[str | None, Header(description="where the body begins; must be the upload's")] = None,
+    upload_checksum: TusChecksum = None,
+) -> Response:
+    """Send the bytes that follow (tus). The newest request wins: an older one that is still open ends."""
+    if tus_resumable is None:
+        raise tus.unsupported_version(None)
+    if request.headers.get("content-type") != tus.OFFSET_STREAM:
+        raise ApiError(ErrorCode.bad_request, f"the Content-Type must be {tus.OFFSET_STREAM}", status=415)
+    offset = tus.whole_number("Upload-Offset", upload_offset)
+    checksum = tus.parse_checksum(upload_checksum)
+    row = await run_in_threadpool(intake.store.uploads.upload, upload_id, caller.owner)
+    view = await _receive(request, intake, row, offset, checksum)
+    return Response(status_code=204, headers=_progress(view))
 
 
 @router.delete("/uploads/{upload_id}", status_code=204)
-def delete_upload(upload_id: str, caller: Writer, service: TheService) -> Response:
+async def delete_upload(upload_id: UploadId, caller: Writer, intake: TheIntake, request: Request) -> Response:
     """Remove an upload that no job needs."""
-    service.delete_upload(caller.owner, upload_id)
+    await run_in_threadpool(intake.view, caller.owner, upload_id)
+    await _bodies(request).end(upload_id, PATIENCE)
+    await run_in_threadpool(intake.delete, caller.owner, upload_id)
     return Response(status_code=204)
 
 
@@ -94,3 +170,58 @@ def delete_upload(upload_id: str, caller: Writer, service: TheService) -> Respon
 def get_storage(service: TheService) -> StorageInfo:
     """What the server accepts at most, and how long it keeps things."""
     return service.storage()
+
+
+async def _receive(
+    request: Request, intake: Intake, row: UploadRow, offset: int = 0, checksum: Checksum | None = None
+) -> UploadView:
+    """The body of a request that goes on with an upload at `offset`."""
+    if row.source is not None:
+        raise ApiError(ErrorCode.conflict, f"upload {row.id} is held by reference: it takes no bytes")
+    length = request.headers.get("content-length", "0")
+    async with _bodies(request).alone(row.id, PATIENCE) as body:
+        row = await run_in_threadpool(intake.store.uploads.upload, row.id, row.owner)
+        if row.sha256 is not None:
+            _check_place(row, offset, length)
+            return upload_view(row)
+        receiving = await run_in_threadpool(intake.resume, row.owner, row.id, checksum)
+        try:
+            _check_place(receiving.row, offset, length)
+            await receive(body, request.stream(), receiving, intake.settings.idle_seconds)
+            return await run_in_threadpool(receiving.end)
+        finally:
+            receiving.close()
+
+
+def _check_place(row: UploadRow, offset: int, length: str) -> None:
+    if offset != row.offset:
+        raise ApiError(ErrorCode.conflict, f"upload {row.id} is at offset {row.offset}, not at {offset}")
+    if length.isdigit() and int(length) > row.size - offset:
+        raise ApiError(ErrorCode.too_large, f"{length} bytes come, {row.size - offset} are missing")
+
+
+async def _receive_whole(request: Request, intake: Intake, row: UploadRow) -> UploadView:
+    """The body of a plain upload: all of it, or nothing is kept."""
+    try:
+        view = await _receive(request, intake, row)
+        if not view.complete:
+            raise ApiError(ErrorCode.bad_request, f"{view.offset} bytes came, {row.size} were announced")
+    except Exception:
+        await run_in_threadpool(intake.forget, row.id)
+        raise
+    except BaseException:
+        intake.forget(row.id)  # inline: a canceled task could not wait for a thread
+        raise
+    return view
+
+
+def _bodies(request: Request) -> OpenBodies:
+    bodies: OpenBodies = request.app.state.bodies
+    return bodies
+
+
+def _progress(view: UploadView) -> dict[str, str]:
+    headers = {"Upload-Offset": str(view.offset)}
+    if not view.complete and view.expires_at is not None:
+        headers["Upload-Expires"] = tus.http_date(view.expires_at)
+    return headers

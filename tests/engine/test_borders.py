@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 import trimesh
 
-from advtex_engine.borders import close_pinholes, fill_notches, mend_borders
+from advtex_engine.borders import close_pinholes, fill_notches, grow_borders, mend_borders
 from advtex_engine.geometry import decimate
 from advtex_engine.monitor import Monitor
 from advtex_engine.scene import Mesh
@@ -78,3 +79,25 @@ def test_a_drawn_mesh_keeps_its_openings() -> None:
     faces = torch.from_numpy(box.faces.astype("int64"))[2:]
     opened = Mesh(torch.from_numpy(box.vertices.astype("float32")), faces)
     assert decimate(opened, 80_000, Monitor()) is opened
+
+
+def test_borders_grow_outward_in_their_plane_and_nothing_else_moves() -> None:
+    sheet = grid(10, without={2 * (10 * y + x) + side for y in range(4, 6) for x in range(4, 6) for side in (0, 1)})
+    grown = grow_borders(sheet, 0.1)
+    before, after = sheet.v_pos, grown.v_pos
+    assert grown.t_pos_idx is sheet.t_pos_idx
+    moved = (after - before).norm(dim=1)
+    inside = ((before[:, :2] - 5).abs().amax(1) < 5) & ((before[:, :2] - 5).abs().amax(1) > 1)
+    assert float(moved[inside].max()) == 0.0
+    assert float(moved.max()) <= 0.1 + 1e-6
+    assert torch.equal(after[:, 2], before[:, 2])
+    left = (before[:, 0] == 0) & (before[:, 1] > 0) & (before[:, 1] < 10)
+    np.testing.assert_allclose(after[left], before[left] - torch.tensor([0.1, 0.0, 0.0]), atol=1e-6)
+    into_the_hole = (before == torch.tensor([4.0, 5.0, 0.0])).all(dim=1)
+    np.testing.assert_allclose(after[into_the_hole], [[4.1, 5.0, 0.0]], atol=1e-6)
+
+
+def test_a_closed_mesh_does_not_grow() -> None:
+    sphere = trimesh.creation.icosphere(subdivisions=2)
+    mesh = make(sphere.vertices.tolist(), sphere.faces.tolist())
+    assert torch.equal(grow_borders(mesh, 0.1).v_pos, mesh.v_pos)

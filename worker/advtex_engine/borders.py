@@ -1,8 +1,8 @@
 """Mending the open borders of a scanned mesh. Positions in world metres; nothing here is differentiable.
 
-Scanners leave pinholes where their blocks meet, and borders that run in teeth along their grid: black specks in every
-picture of the model. Only for meshes with more faces than needed: an opening of a few edges is a pinhole there, and a
-window in a mesh that somebody drew.
+Scanners leave pinholes where their blocks meet, and borders that run in teeth along their grid; decimation cuts corners
+off what is left: black specks in every picture of the model. Only for meshes with more faces than needed: an opening of
+a few edges is a pinhole there, and a window in a mesh that somebody drew.
 """
 
 from __future__ import annotations
@@ -22,6 +22,12 @@ Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 
+def median_edge(mesh: Mesh) -> float:
+    """Metres; every edge counts once per face."""
+    corners = mesh.v_pos.numpy().astype(np.float64)[mesh.t_pos_idx.numpy()]
+    return float(np.median(np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)))
+
+
 def mend_borders(mesh: Mesh) -> Mesh:
     """A clean mesh with notches filled and pinholes closed, without uv."""
     bare = Mesh(mesh.v_pos, mesh.t_pos_idx)
@@ -31,8 +37,7 @@ def mend_borders(mesh: Mesh) -> Mesh:
 def fill_notches(mesh: Mesh) -> Mesh:
     """A triangle into every concave corner of the border that is at most NOTCH_WIDTH wide, narrow ones first."""
     position, faces = mesh.v_pos.numpy().astype(np.float64), mesh.t_pos_idx.numpy()
-    sides = position[faces] - position[np.roll(faces, -1, axis=1)]
-    widest = NOTCH_WIDTH * float(np.median(np.linalg.norm(sides, axis=2)))
+    widest = NOTCH_WIDTH * median_edge(mesh)
     for _ in range(NOTCH_PASSES):
         added = _notches(position, faces, widest)
         if len(added) == 0:
@@ -67,6 +72,20 @@ def close_pinholes(mesh: Mesh) -> Mesh:
         torch.from_numpy(np.concatenate((position, np.array(centers, dtype=np.float32)))),
         torch.from_numpy(np.concatenate((faces, *added))),
     )
+
+
+def grow_borders(mesh: Mesh, width: float) -> Mesh:
+    """The border's vertices moved outward in their faces' plane by up to `width` metres; less at sharp corners."""
+    position = mesh.v_pos.numpy().astype(np.float64)
+    edges, normals = _border(mesh.v_pos.numpy(), mesh.t_pos_idx.numpy())
+    along = position[edges[:, 1]] - position[edges[:, 0]]
+    outward, length, share = np.cross(along, _unit(normals)), np.linalg.norm(along, axis=1), np.zeros(len(position))
+    offset = np.zeros_like(position)
+    for corner in edges.T:
+        np.add.at(offset, corner, outward)
+        np.add.at(share, corner, length)
+    offset *= width / np.maximum(share, 1e-30)[:, None]
+    return Mesh(torch.from_numpy((position + offset).astype(np.float32)), mesh.t_pos_idx)
 
 
 def _notches(position: Floats, faces: Integers, widest: float) -> Integers:

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from advtex_engine.borders import mend_borders
+from advtex_engine.borders import grow_borders, median_edge, mend_borders
 from advtex_engine.errors import Problem, ScanError
 from advtex_engine.monitor import Monitor
 from advtex_engine.scene import Mesh
@@ -17,6 +17,9 @@ MIN_RELATIVE_HEIGHT = 1e-7
 # Quadric decimation stops short of its target when it runs out of cheap edges; every further round presses harder.
 DECIMATION_ROUNDS = 4
 DECIMATION_AGGRESSION = 5.0
+# Of the median edge before decimation: what collapsing along a border cuts off. Two of 10,000 pixels of a kitchen were
+# missed for want of it; 2 mm of growth, under a pixel, halved them and took the held-out LPIPS from .217 to .206.
+BORDER_GROWTH = 0.15
 
 
 def clean(mesh: Mesh) -> Mesh:
@@ -52,8 +55,8 @@ def clean(mesh: Mesh) -> Mesh:
 def decimate(mesh: Mesh, face_budget: int, monitor: Monitor) -> Mesh:
     """At most `face_budget` faces of a clean mesh, by quadric edge collapse (Garland & Heckbert 1997); deterministic.
 
-    A mesh within the budget is returned as it is, uv included. Else its borders are mended first. Decimation moves
-    vertices across uv seams, so that uv are dropped, which the monitor is told.
+    A mesh within the budget is returned as it is, uv included. Else its borders are mended before and grown
+    after. Decimation moves vertices across uv seams, so that uv are dropped, which the monitor is told.
     """
     if len(mesh.t_pos_idx) <= face_budget:
         return mesh
@@ -81,6 +84,7 @@ def decimate(mesh: Mesh, face_budget: int, monitor: Monitor) -> Mesh:
         if len(faces) <= face_budget:
             break
     decimated = clean(Mesh(torch.from_numpy(position.astype(np.float32)), torch.from_numpy(faces.astype(np.int64))))
+    decimated = grow_borders(decimated, BORDER_GROWTH * median_edge(mesh))
     if len(decimated.t_pos_idx) > face_budget:
         monitor.warning(
             Problem(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import random
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,15 +21,16 @@ from advtex_client.errors import (
     ScanRejectedError,
     error_from_response,
 )
-from advtex_client.uploads import FileStream, OnBytes, PackedScan
+from advtex_client.uploads import FileStream, PackedScan
 from advtex_contract.errors import ErrorCode
-from advtex_contract.jobs import TERMINAL, JobPage, JobSpec, JobState, JobView, ResultFile, UploadView
+from advtex_contract.jobs import TERMINAL, JobPage, JobSpec, JobState, JobView, ResultFile, UploadList, UploadView
 
 T = TypeVar("T")
 M = TypeVar("M", bound=BaseModel)
 
 TRANSIENT = frozenset({502, 504})
 REFUSED = frozenset({429, 503})
+TUS = {"Tus-Resumable": "1.0.0"}
 NEVER_SENT = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout)
 
 
@@ -44,6 +46,13 @@ class Call(Generic[T]):
     params: Mapping[str, str | int] = field(default_factory=dict)
     headers: Mapping[str, str] = field(default_factory=dict)
     body: FileStream | None = None
+
+
+@dataclass(frozen=True)
+class Pause:
+    """Seconds to wait before the next call."""
+
+    seconds: float
 
 
 def get_job(job_id: str) -> Call[JobView]:
@@ -73,22 +82,43 @@ def list_jobs(state: JobState | None, label: str | None, limit: int, cursor: str
 
 
 def get_upload(upload_id: str) -> Call[UploadView]:
-    return Call("GET", f"/v1/uploads/{quote(upload_id, safe='')}", reader(UploadView))
+    return Call("GET", _upload(upload_id), reader(UploadView))
 
 
-def upload(scan: PackedScan, on_bytes: OnBytes | None = None) -> Call[UploadView]:
-    """Sent again after trouble on the line: an upload that nobody refers to expires by itself."""
-    headers = {
-        "Content-Type": "application/zip",
-        "Content-Length": str(scan.size),
-        "X-Content-SHA256": scan.sha256,
-        "X-Filename": quote(scan.filename),
+def find_uploads(sha256: str) -> Call[UploadList]:
+    """What the server holds of these bytes."""
+    return Call("GET", "/v1/uploads", reader(UploadList), params={"sha256": sha256})
+
+
+def begin_upload(scan: PackedScan) -> Call[UploadView]:
+    """A resumable upload (tus 1.0.0). Not sent again blindly: the server holds room for every one that it began."""
+    given = {"filename": scan.filename, "sha256": scan.sha256}
+    pairs = (f"{name} {base64.b64encode(value.encode()).decode()}" for name, value in given.items())
+    headers = TUS | {"Upload-Length": str(scan.size), "Upload-Metadata": ",".join(pairs)}
+    return Call("POST", "/v1/uploads", reader(UploadView), idempotent=False, headers=headers)
+
+
+def upload_offset(upload_id: str) -> Call[int]:
+    """Where to go on, once the line broke."""
+    return Call("HEAD", _upload(upload_id), _offset, headers=TUS)
+
+
+def send_piece(upload_id: str, piece: FileStream) -> Call[int]:
+    """-> the new offset. Not sent again as it is: first the server must say how much of it came."""
+    headers = TUS | {
+        "Content-Type": "application/offset+octet-stream",
+        "Content-Length": str(piece.stop - piece.start),
+        "Upload-Offset": str(piece.start),
     }
-    return Call("POST", "/v1/uploads", reader(UploadView), headers=headers, body=FileStream(scan, on_bytes))
+    return Call("PATCH", _upload(upload_id), _offset, idempotent=False, headers=headers, body=piece)
 
 
 def events_path(job_id: str) -> str:
     return f"{_job(job_id)}/events"
+
+
+def _upload(upload_id: str) -> str:
+    return f"/v1/uploads/{quote(upload_id, safe='')}"
 
 
 def _job(job_id: str) -> str:
@@ -109,6 +139,14 @@ def reader(model: type[M]) -> Callable[[httpx.Response], M]:
             ) from error
 
     return read
+
+
+def _offset(response: httpx.Response) -> int:
+    raise_for_error(response)
+    offset = response.headers.get("Upload-Offset", "")
+    if not offset.isdigit():
+        raise ClientError(f"{response.request.url} does not say how much it holds; is it an advtex server?")
+    return int(offset)
 
 
 def _nothing(response: httpx.Response) -> None:

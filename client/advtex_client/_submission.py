@@ -1,6 +1,6 @@
 """Submitting a scan, step by step, without sending anything itself.
 
-`submission` is a generator: it yields each Call to be made, receives its answer (or the ApiError that it ended in),
+`submission` is a generator: it yields each Call to be made, receives its answer (or the ClientError that it ended in),
 and returns the job. Both clients drive it.
 """
 
@@ -14,6 +14,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from advtex_client import _calls as calls
+from advtex_client._sending import Step, sending
 from advtex_client.errors import ClientError, ConflictError, NotFoundError, ScanRejectedError
 from advtex_client.memory import Submission, SubmissionMemory
 from advtex_client.uploads import OnBytes, PackedScan
@@ -22,7 +23,7 @@ from advtex_contract.jobs import JobSpec, JobView
 from advtex_contract.options import JobOptions
 from advtex_scan.check import check_scan
 
-Steps = Generator[calls.Call[Any], Any, JobView]
+Steps = Generator[Step, Any, JobView]
 
 
 def ensure_submittable(scan: Path, label: str) -> None:
@@ -48,6 +49,7 @@ def submission(
     options: JobOptions,
     label: str,
     *,
+    retries: int,
     new: bool = False,
     on_bytes: OnBytes | None = None,
 ) -> Steps:
@@ -62,7 +64,7 @@ def submission(
     if new:
         known = Submission(salt=f"-{secrets.token_hex(8)}", upload_id=known.upload_id)
         memory.save(known)
-    known = yield from _uploaded(memory, known, scan, on_bytes)
+    known = yield from _uploaded(memory, known, scan, retries, on_bytes)
     assert known.upload_id is not None
     spec = JobSpec(upload_id=known.upload_id, options=options, label=label)
     try:
@@ -79,21 +81,11 @@ def submission(
 
 
 def _uploaded(
-    memory: SubmissionMemory, known: Submission, scan: PackedScan, on_bytes: OnBytes | None
-) -> Generator[calls.Call[Any], Any, Submission]:
-    """The submission with an upload that the server holds whole; sent only if it does not hold it already."""
-    if known.upload_id is not None:
-        try:
-            upload = yield calls.get_upload(known.upload_id)
-            if upload.complete and upload.sha256 == scan.sha256:
-                return known
-        except NotFoundError:
-            pass
-    upload = yield calls.upload(scan, on_bytes)
-    if upload.sha256 != scan.sha256:
-        raise ClientError(
-            f"{scan.filename} arrived damaged (sha256 {upload.sha256}, sent {scan.sha256}); submit it again"
-        )
-    known = known.model_copy(update={"upload_id": upload.id})
-    memory.save(known)
+    memory: SubmissionMemory, known: Submission, scan: PackedScan, retries: int, on_bytes: OnBytes | None
+) -> Generator[Step, Any, Submission]:
+    """The submission with an upload that the server holds whole."""
+    upload = yield from sending(scan, retries, on_bytes, known.upload_id)
+    if upload.id != known.upload_id:
+        known = known.model_copy(update={"upload_id": upload.id})
+        memory.save(known)
     return known

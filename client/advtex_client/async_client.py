@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Generator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import anyio
 import httpx
@@ -15,11 +15,12 @@ from anyio.to_thread import run_sync
 from advtex_client import _calls as calls
 from advtex_client._events import OnTrouble, Watch, is_event_stream
 from advtex_client._http import LIMITS, TIMEOUT, base_headers, build, result_url
-from advtex_client._submission import Steps, ensure_submittable, submission
+from advtex_client._sending import Step, sending
+from advtex_client._submission import ensure_submittable, submission
 from advtex_client.config import load_config
 from advtex_client.downloads import Download, OnFileBytes, is_there, target_path
-from advtex_client.errors import ApiError, ClientError
-from advtex_client.memory import SubmissionMemory
+from advtex_client.errors import ClientError
+from advtex_client.memory import SubmissionMemory, upload_alone
 from advtex_client.uploads import OnBytes, packed
 from advtex_contract.jobs import JobSpec, JobState, JobView, ResultFile, UploadView
 from advtex_contract.options import JobOptions
@@ -68,7 +69,8 @@ class AsyncClient:
         """Send a scan, zip or folder."""
         with ExitStack() as stack:
             archive = await run_sync(stack.enter_context, packed(scan))
-            return await self._run(calls.upload(archive, on_bytes))
+            await run_sync(stack.enter_context, upload_alone(self.config.url, archive.sha256))
+            return await self._drive(sending(archive, self._retries, on_bytes))
 
     async def get_upload(self, upload_id: str) -> UploadView:
         return await self._run(calls.get_upload(upload_id))
@@ -96,21 +98,28 @@ class AsyncClient:
             archive = await run_sync(stack.enter_context, packed(scan))
             memory = SubmissionMemory(self.config.url, archive.sha256, options, label)
             await run_sync(stack.enter_context, memory.alone())
-            return await self._submit(submission(memory, archive, options, label, new=new, on_bytes=on_bytes))
+            await run_sync(stack.enter_context, upload_alone(self.config.url, archive.sha256))
+            return await self._drive(
+                submission(memory, archive, options, label, retries=self._retries, new=new, on_bytes=on_bytes)
+            )
 
-    async def _submit(self, steps: Steps) -> JobView:
+    async def _drive(self, steps: Generator[Step, Any, T]) -> T:
         try:
-            call = next(steps)
+            step = next(steps)
             while True:
+                if isinstance(step, calls.Pause):
+                    await anyio.sleep(step.seconds)
+                    step = next(steps)
+                    continue
                 try:
-                    answer = await self._run(call)
-                except ApiError as error:
-                    call = steps.throw(error)
+                    answer = await self._run(step)
+                except ClientError as error:
+                    step = steps.throw(error)
                 else:
-                    call = steps.send(answer)
+                    step = steps.send(answer)
         except StopIteration as end:
-            job: JobView = end.value
-            return job
+            result: T = end.value
+            return result
 
     async def get_job(self, job_id: str) -> JobView:
         return await self._run(calls.get_job(job_id))

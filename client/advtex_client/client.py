@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import httpx
 
 from advtex_client import _calls as calls
 from advtex_client._events import OnTrouble, Watch, is_event_stream
 from advtex_client._http import LIMITS, TIMEOUT, base_headers, build, result_url
-from advtex_client._submission import Steps, ensure_submittable, submission
+from advtex_client._sending import Step, sending
+from advtex_client._submission import ensure_submittable, submission
 from advtex_client.config import load_config
 from advtex_client.downloads import Download, OnFileBytes, is_there, target_path
-from advtex_client.errors import ApiError, ClientError
-from advtex_client.memory import SubmissionMemory
+from advtex_client.errors import ClientError
+from advtex_client.memory import SubmissionMemory, upload_alone
 from advtex_client.uploads import OnBytes, packed
 from advtex_contract.jobs import JobSpec, JobState, JobView, ResultFile, UploadView
 from advtex_contract.options import JobOptions
@@ -64,8 +65,8 @@ class Client:
 
     def upload(self, scan: Path, *, on_bytes: OnBytes | None = None) -> UploadView:
         """Send a scan, zip or folder."""
-        with packed(scan) as archive:
-            return self._run(calls.upload(archive, on_bytes))
+        with packed(scan) as archive, upload_alone(self.config.url, archive.sha256):
+            return self._drive(sending(archive, self._retries, on_bytes))
 
     def get_upload(self, upload_id: str) -> UploadView:
         return self._run(calls.get_upload(upload_id))
@@ -91,22 +92,27 @@ class Client:
         options = options or JobOptions()
         with packed(scan) as archive:
             memory = SubmissionMemory(self.config.url, archive.sha256, options, label)
-            with memory.alone():
-                return self._submit(submission(memory, archive, options, label, new=new, on_bytes=on_bytes))
+            steps = submission(memory, archive, options, label, retries=self._retries, new=new, on_bytes=on_bytes)
+            with memory.alone(), upload_alone(self.config.url, archive.sha256):
+                return self._drive(steps)
 
-    def _submit(self, steps: Steps) -> JobView:
+    def _drive(self, steps: Generator[Step, Any, T]) -> T:
         try:
-            call = next(steps)
+            step = next(steps)
             while True:
+                if isinstance(step, calls.Pause):
+                    time.sleep(step.seconds)
+                    step = next(steps)
+                    continue
                 try:
-                    answer = self._run(call)
-                except ApiError as error:
-                    call = steps.throw(error)
+                    answer = self._run(step)
+                except ClientError as error:
+                    step = steps.throw(error)
                 else:
-                    call = steps.send(answer)
+                    step = steps.send(answer)
         except StopIteration as end:
-            job: JobView = end.value
-            return job
+            result: T = end.value
+            return result
 
     def get_job(self, job_id: str) -> JobView:
         return self._run(calls.get_job(job_id))

@@ -10,7 +10,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import platformdirs
@@ -20,6 +20,12 @@ from advtex_contract.options import JobOptions
 
 if sys.platform != "win32":
     import fcntl
+
+
+def upload_alone(server: str, sha256: str, folder: Path | None = None) -> AbstractContextManager[None]:
+    """One run at a time sends these bytes; another would take the upload over from it."""
+    place = hashlib.sha256(f"{server}\n{sha256}".encode()).hexdigest()[:32]
+    return _locked(_folder(folder) / "uploads" / f"{place}.lock")
 
 
 class Submission(BaseModel):
@@ -40,16 +46,11 @@ class SubmissionMemory:
             "\n".join((sha256, options.model_dump_json(), label)).encode()  # a label holds no line break
         ).hexdigest()
         place = hashlib.sha256(f"{server}\n{self._identity}".encode()).hexdigest()[:32]
-        self.path = (folder or platformdirs.user_state_path("advtex")) / "submissions" / f"{place}.json"
+        self.path = _folder(folder) / "submissions" / f"{place}.json"
 
-    @contextmanager
-    def alone(self) -> Iterator[None]:
+    def alone(self) -> AbstractContextManager[None]:
         """Wait for other runs of the same submission on this computer, and keep them waiting."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self.path.with_suffix(".lock").open("a") as file:
-            if sys.platform != "win32":  # elsewhere the server's idempotency alone prevents a second job
-                fcntl.flock(file, fcntl.LOCK_EX)
-            yield
+        return _locked(self.path.with_suffix(".lock"))
 
     def load(self) -> Submission:
         """What is remembered; a fresh record when there is nothing, or nothing that can be read."""
@@ -70,3 +71,16 @@ class SubmissionMemory:
     def idempotency_key(self, submission: Submission) -> str:
         """The same for every try of the same submission."""
         return f"{self._identity[:48]}{submission.salt}"
+
+
+def _folder(folder: Path | None) -> Path:
+    return folder or platformdirs.user_state_path("advtex")
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a") as file:
+        if sys.platform != "win32":  # elsewhere the server alone decides who was first
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield

@@ -19,6 +19,7 @@ import httpx
 from advtex_client.errors import ClientError
 
 CHUNK = 1 << 20
+PIECE = 64 << 20  # bytes per request: after it, the server has confirmed them, and no proxy has to hold more
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest date that a zip can hold
 
 OnBytes = Callable[[int, int], None]
@@ -93,28 +94,30 @@ def _hashed(path: Path, filename: str) -> PackedScan:
 
 
 class FileStream(httpx.SyncByteStream, httpx.AsyncByteStream):
-    """A file as a request body, for both clients, readable again for a retry."""
+    """Bytes `start` up to, not including, `stop` of a file as a request body, for both clients; readable again."""
 
-    def __init__(self, scan: PackedScan, on_bytes: OnBytes | None = None) -> None:
+    def __init__(self, scan: PackedScan, start: int = 0, on_bytes: OnBytes | None = None) -> None:
+        self.start = start
+        self.stop = min(scan.size, start + PIECE)
         self._scan = scan
         self._on_bytes = on_bytes
 
     def __iter__(self) -> Iterator[bytes]:
-        done = 0
+        done = self.start
         with self._scan.path.open("rb") as file:
-            while chunk := file.read(CHUNK):
+            file.seek(done)
+            while done < self.stop:
+                chunk = file.read(min(CHUNK, self.stop - done))
                 done += len(chunk)
-                self._check(done)
+                if not chunk or (done == self._scan.size and file.read(1)):
+                    raise ClientError(
+                        f"{self._scan.path} changed while it was being sent; submit it again when it is complete"
+                    )
                 yield chunk
                 if self._on_bytes:
                     self._on_bytes(done, self._scan.size)
-        self._check(done, ended=True)
 
     async def __aiter__(self) -> AsyncIterator[bytes]:
         chunks = iter(self)
         while (chunk := await anyio.to_thread.run_sync(next, chunks, b"")) != b"":
             yield chunk
-
-    def _check(self, done: int, ended: bool = False) -> None:
-        if done > self._scan.size or (ended and done < self._scan.size):
-            raise ClientError(f"{self._scan.path} changed while it was being sent; submit it again when it is complete")

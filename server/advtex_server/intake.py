@@ -24,7 +24,7 @@ from advtex_server.settings import ServerSettings
 from advtex_store import keys
 from advtex_store.accounts import Caller
 from advtex_store.blobs import FolderBlobs
-from advtex_store.errors import QuotaExceeded, StoreError
+from advtex_store.errors import BlobNotFound, QuotaExceeded, RecordNotFound, StoreError
 from advtex_store.models import UploadRow
 from advtex_store.partials import Partial
 from advtex_store.store import Store
@@ -78,9 +78,14 @@ class Intake:
             raise ApiError(ErrorCode.quota_exceeded, str(error), status=413) from error
 
     def resume(self, owner: str, upload_id: str, checksum: Checksum | None = None) -> Receiving:
-        """Take over an unfinished upload. RecordNotFound; BlobNotFound if its bytes are gone."""
+        """Take over an unfinished upload. RecordNotFound, also when its bytes are gone: then it is forgotten."""
         row = self.store.uploads.seize(upload_id, owner)
-        partial = self.store.blobs.resume(keys.scan_key(row.id), row.size, row.offset)
+        try:
+            partial = self.store.blobs.resume(keys.scan_key(row.id), row.size, row.offset)
+        except BlobNotFound as error:
+            log.error("an upload has lost its bytes", upload=row.id, offset=row.offset)
+            self.forget(row.id)
+            raise RecordNotFound(f"upload {row.id} has lost its bytes: begin a new one") from error
         return Receiving(self, row, partial, checksum)
 
     def offset(self, owner: str, upload_id: str) -> UploadRow:

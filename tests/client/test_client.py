@@ -8,7 +8,7 @@ from pathlib import Path
 import anyio
 import httpx
 import pytest
-from fake_server import FakeServer, answers, breaks, refuses, view
+from fake_server import FakeServer, answers, breaks, cuts_off_after, refuses, view
 from tiny_scan import write_zip
 
 from advtex_client import (
@@ -27,6 +27,7 @@ from advtex_client import (
     WaitTimeoutError,
 )
 from advtex_client._calls import Attempts
+from advtex_client.uploads import packed
 from advtex_contract.errors import ErrorCode
 from advtex_contract.jobs import JobError, JobState
 from advtex_contract.options import JobOptions
@@ -132,11 +133,120 @@ def test_submit_sends_the_scan_once_and_makes_one_job(server: FakeServer, client
     assert len(server.uploads) == len(server.jobs) == 1
 
 
-def test_other_options_or_labels_are_other_jobs_of_one_upload_each(
-    server: FakeServer, client: Client, scan: Path
-) -> None:
+def test_other_options_or_labels_are_other_jobs_of_one_upload(server: FakeServer, client: Client, scan: Path) -> None:
     ids = [client.submit(scan, JobOptions(seed=seed), label=label).id for seed in (0, 1) for label in ("", "b")]
     assert len(set(ids)) == 4
+    assert list(server.uploads) == ["u0"]
+    assert server.received == server.uploads["u0"].size, "what the server holds is not sent again"
+
+
+PIECE = 10_000
+
+
+def test_a_line_that_breaks_again_and_again_costs_only_what_was_on_it(
+    server: FakeServer, client: Client, scan: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("advtex_client.uploads.PIECE", PIECE)
+    cuts = iter([5000, 0, 9999, 10_000, 0, 0, 0, 1, 0, 0, 0, 0, 7000])
+
+    def handle(request: httpx.Request) -> httpx.Response:
+        if request.method == "PATCH" and (cut := next(cuts, None)) is not None:
+            request.read()
+            return cuts_off_after(server, cut)(request)
+        return server.handle(request)
+
+    with Client(URL, "k", transport=httpx.MockTransport(handle)) as broken:
+        upload = broken.upload(scan)
+    assert upload.complete
+    assert server.received == upload.size
+    with packed(scan) as archive:
+        assert server.bytes[upload.id] == archive.path.read_bytes()
+    assert max(len(request.content) for request in server.requests) <= PIECE
+
+
+def test_a_line_that_never_comes_back_is_given_up_and_the_next_run_goes_on(
+    server: FakeServer, scan: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("advtex_client.uploads.PIECE", PIECE)
+    pieces = iter([None, None])
+
+    def handle(request: httpx.Request) -> httpx.Response:
+        if request.method == "PATCH" and next(pieces, 0) is not None:
+            raise httpx.WriteError("connection reset", request=request)
+        return server.handle(request)
+
+    with (
+        Client(URL, "k", retries=3, transport=httpx.MockTransport(handle)) as broken,
+        pytest.raises(NetworkError, match="connection reset"),
+    ):
+        broken.submit(scan)
+    assert server.received == 2 * PIECE
+    with Client(URL, "k", transport=server.transport) as client:
+        client.submit(scan)
+    assert server.received == server.uploads["u0"].size
+    assert list(server.uploads) == ["u0"]
+
+
+def test_an_upload_whose_creation_was_never_answered_is_found(server: FakeServer, scan: Path) -> None:
+    lost = iter([True])
+
+    def handle(request: httpx.Request) -> httpx.Response:
+        answer = server.handle(request)
+        if request.method == "POST" and request.url.path == "/v1/uploads" and next(lost, False):
+            raise httpx.ReadError("connection reset", request=request)
+        return answer
+
+    with Client(URL, "k", transport=httpx.MockTransport(handle)) as client:
+        assert client.upload(scan).id == "u0"
+    assert list(server.uploads) == ["u0"]
+
+
+def test_an_upload_that_vanished_is_begun_anew(server: FakeServer, scan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("advtex_client.uploads.PIECE", PIECE)
+    count = 0
+
+    def handle(request: httpx.Request) -> httpx.Response:
+        nonlocal count
+        count += request.method == "PATCH"
+        if request.method == "PATCH" and count == 3:
+            server.uploads.clear()
+        return server.handle(request)
+
+    with Client(URL, "k", transport=httpx.MockTransport(handle)) as client:
+        upload = client.upload(scan)
+    assert (upload.id, upload.complete) == ("u1", True)
+
+
+def test_a_refusal_is_not_tried_again(server: FakeServer, client: Client, scan: Path) -> None:
+    def handle(request: httpx.Request) -> httpx.Response:
+        return answers(413, ErrorCode.quota_exceeded)(request) if request.method == "POST" else server.handle(request)
+
+    with Client(URL, "k", transport=httpx.MockTransport(handle)) as refused, pytest.raises(InvalidRequestError):
+        refused.upload(scan)
+    assert server.count("GET", "/v1/uploads") == 1
+
+
+def test_the_async_client_goes_on_too(server: FakeServer, scan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("advtex_client.uploads.PIECE", PIECE)
+    cuts = iter([5000, 0])
+
+    async def handle(request: httpx.Request) -> httpx.Response:
+        if request.method == "PATCH" and (cut := next(cuts, None)) is not None:
+            await request.aread()
+            return cuts_off_after(server, cut)(request)
+        await request.aread()
+        return server.handle(request)
+
+    async def upload() -> bool:
+        async with AsyncClient(URL, "k", transport=httpx.MockTransport(handle)) as client:
+            return (await client.upload(scan)).complete
+
+    async def at_once(_seconds: float) -> None:
+        return
+
+    monkeypatch.setattr("advtex_client.async_client.anyio.sleep", at_once)
+    assert anyio.run(upload)
+    assert server.received == server.uploads["u0"].size
 
 
 def test_new_makes_another_job_from_the_same_upload(server: FakeServer, client: Client, scan: Path) -> None:
@@ -178,9 +288,13 @@ def test_a_job_that_was_deleted_is_made_again(server: FakeServer, client: Client
 def test_a_submission_that_this_computer_forgot_says_what_to_do(
     server: FakeServer, client: Client, scan: Path, tmp_path: Path
 ) -> None:
-    client.submit(scan)
+    job = client.submit(scan)
     for file in (tmp_path / "state").rglob("*.json"):
         file.write_text("not json")
+    assert client.submit(scan).id == job.id, "the server knows the upload by its sha256, and the job by its key"
+    for file in (tmp_path / "state").rglob("*.json"):
+        file.write_text("not json")
+    server.uploads.clear()
     with pytest.raises(ClientError, match="--new makes another one"):
         client.submit(scan)
     assert client.submit(scan, new=True).id == "j1"
@@ -212,9 +326,8 @@ def test_a_bad_scan_is_not_sent(server: FakeServer, client: Client, scan: Path) 
 def test_a_zip_is_sent_as_it_is(server: FakeServer, client: Client, scan: Path, tmp_path: Path) -> None:
     archive = write_zip(tmp_path / "my scan.zip", scan)
     client.submit(archive)
-    (request,) = [request for request in server.requests if request.url.path == "/v1/uploads"]
-    assert request.content == archive.read_bytes()
-    assert request.headers["X-Filename"] == "my%20scan.zip"
+    assert server.bytes["u0"] == archive.read_bytes()
+    assert server.uploads["u0"].filename == "my scan.zip"
 
 
 STEPS = [

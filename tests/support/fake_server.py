@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import json
 import re
@@ -11,7 +12,7 @@ from datetime import UTC, datetime
 import httpx
 
 from advtex_contract.errors import ErrorBody, ErrorCode
-from advtex_contract.jobs import JobSpec, JobState, JobView, Progress, ResultFile, UploadView
+from advtex_contract.jobs import JobSpec, JobState, JobView, Progress, ResultFile, UploadList, UploadView
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 Fault = Callable[[httpx.Request], httpx.Response]
@@ -22,6 +23,10 @@ class FakeServer:
 
     def __init__(self) -> None:
         self.uploads: dict[str, UploadView] = {}
+        self.bytes: dict[str, bytes] = {}
+        self.announced: dict[str, str] = {}
+        self.begun = 0
+        self.received = 0
         self.jobs: dict[str, JobView] = {}
         self.keys: dict[str, tuple[str, str]] = {}
         self.results: dict[str, bytes] = {}
@@ -38,10 +43,9 @@ class FakeServer:
             return self.faults.pop(0)(request)
         path = request.url.path
         if path == "/v1/uploads":
-            return self._upload(request, body)
+            return self._begin(request) if request.method == "POST" else self._find(request.url.params["sha256"])
         if match := re.fullmatch(r"/v1/uploads/(\w+)", path):
-            upload = self.uploads.get(match[1])
-            return ok(upload) if upload else error(404, ErrorCode.not_found)
+            return self._upload(request, match[1], body)
         if path == "/v1/jobs" and request.method == "POST":
             return self._create(request, body)
         if match := re.fullmatch(r"/v1/jobs/([\w-]+)(/\w+)?(?:/(.+))?", path):
@@ -67,16 +71,49 @@ class FakeServer:
         self.jobs[job_id] = self.jobs[job_id].model_copy(update={"state": JobState.succeeded, "results": found})
         return self.jobs[job_id]
 
-    def _upload(self, request: httpx.Request, body: bytes) -> httpx.Response:
-        sha256 = hashlib.sha256(body).hexdigest()
-        if sha256 != request.headers["X-Content-SHA256"] or len(body) != int(request.headers["Content-Length"]):
-            return error(400, ErrorCode.checksum_mismatch)
-        name = f"u{len(self.uploads)}"
-        size = len(body)
+    def _begin(self, request: httpx.Request) -> httpx.Response:
+        assert request.headers["Tus-Resumable"] == "1.0.0"
+        pairs = dict(pair.split(" ") for pair in request.headers["Upload-Metadata"].split(","))
+        given = {name: base64.b64decode(value).decode() for name, value in pairs.items()}
+        name = f"u{self.begun}"
+        self.begun += 1
         self.uploads[name] = UploadView(
-            id=name, size=size, offset=size, complete=True, sha256=sha256, filename="scan.zip", created_at=NOW
+            id=name,
+            size=int(request.headers["Upload-Length"]),
+            offset=0,
+            complete=False,
+            filename=given["filename"],
+            created_at=NOW,
         )
+        self.bytes[name], self.announced[name] = b"", given["sha256"]
         return ok(self.uploads[name], 201)
+
+    def _find(self, sha256: str) -> httpx.Response:
+        found = [upload for name, upload in self.uploads.items() if self.announced[name] == sha256]
+        return ok(UploadList(uploads=sorted(found, key=lambda upload: (not upload.complete, -upload.offset))))
+
+    def _upload(self, request: httpx.Request, name: str, body: bytes) -> httpx.Response:
+        if name not in self.uploads:
+            return error(404, ErrorCode.not_found)
+        if request.method == "PATCH":
+            if int(request.headers["Upload-Offset"]) != len(self.bytes[name]):
+                return error(409, ErrorCode.conflict)
+            assert len(body) == int(request.headers["Content-Length"])
+            self.keep(name, body)
+        elif request.method != "HEAD":
+            return ok(self.uploads[name])
+        status = 204 if request.method == "PATCH" else 200
+        return httpx.Response(status, headers={"Upload-Offset": str(self.uploads[name].offset)})
+
+    def keep(self, name: str, data: bytes) -> None:
+        """These bytes arrived."""
+        self.bytes[name] += data
+        self.received += len(data)
+        whole = len(self.bytes[name]) == self.uploads[name].size
+        sha256 = hashlib.sha256(self.bytes[name]).hexdigest() if whole else None
+        self.uploads[name] = self.uploads[name].model_copy(
+            update={"offset": len(self.bytes[name]), "complete": whole, "sha256": sha256}
+        )
 
     def _create(self, request: httpx.Request, body: bytes) -> httpx.Response:
         key = request.headers["Idempotency-Key"]
@@ -125,7 +162,7 @@ def view(job_id: str, state: JobState = JobState.queued, step: int = 0, **fields
     return JobView.model_validate({"id": job_id, "state": state, "progress": Progress(step=step)} | values)
 
 
-def ok(model: UploadView | JobView, status: int = 200) -> httpx.Response:
+def ok(model: UploadView | UploadList | JobView, status: int = 200) -> httpx.Response:
     return httpx.Response(status, json=json.loads(model.model_dump_json()))
 
 
@@ -140,6 +177,17 @@ def refuses(request: httpx.Request) -> httpx.Response:
 
 def breaks(request: httpx.Request) -> httpx.Response:
     raise httpx.ReadError("connection reset", request=request)
+
+
+def cuts_off_after(server: FakeServer, length: int) -> Fault:
+    """The line breaks after `length` bytes of a piece, which the server keeps."""
+
+    def fault(request: httpx.Request) -> httpx.Response:
+        assert request.method == "PATCH"
+        server.keep(request.url.path.rpartition("/")[2], request.content[:length])
+        raise httpx.WriteError("connection reset", request=request)
+
+    return fault
 
 
 def answers(status: int, code: ErrorCode = ErrorCode.unavailable) -> Fault:

@@ -25,7 +25,7 @@ from advtex_store.settings import StoreSettings
 
 QUEUE = "advtex-"
 TASK = "advtex_worker.tasks.run_job"
-STARTED_GRACE_SECONDS = 30.0  # between taking an id and claiming the row; later the taker is held for dead
+STARTED_GRACE_SECONDS = 10.0  # between taking an id and claiming the row; later the taker is held for dead
 PRESENCE = "advtex:worker:"
 PRESENCE_SECONDS = 20  # a worker that has not announced itself for so long is gone
 

@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from advtex_engine.config import TextureConfig
@@ -40,10 +41,12 @@ def stepping(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume
 
     The history in the state tells where each process began.
     """
-    path = work / "state.json"
+    _steps(out, config.steps or 100, work / "state.json", resume, monitor, lambda _step: None)
+
+
+def _steps(out: Path, steps: int, path: Path, resume: bool, monitor: Monitor, told: Callable[[int], None]) -> None:
     state = json.loads(path.read_text()) if resume and path.exists() else {"step": 0, "chain": "", "began": []}
     state["began"].append(state["step"])
-    steps = config.steps or 100
     monitor.stage_started("optimization")
     while state["step"] < steps:
         if monitor.stop_requested():
@@ -51,11 +54,28 @@ def stepping(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume
             raise Stopped
         time.sleep(0.01)
         state["step"] += 1
+        told(state["step"])
         state["chain"] = hashlib.sha256(f"{state['chain']} {state['step']}".encode()).hexdigest()
         if state["step"] % 10 == 0:
             _save(path, state, monitor)
         monitor.progress(state["step"], steps, {"l1": 1.0 / state["step"]})
     write_results(out, json.dumps(state))
+
+
+def journaled(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
+    """Like `stepping`, but every step is told to the file $JOURNAL with the time and the attempt (the workspace's
+    name). By its seed a job dies in every attempt (seed % 20 == 7), or is rejected (13)."""
+    journal = os.open(os.environ["JOURNAL"], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+
+    if config.seed % 20 == 7:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if config.seed % 20 == 13:
+        rejects(scan, out, config, work=work, resume=resume, monitor=monitor)
+
+    def told(step: int) -> None:
+        os.write(journal, f"{time.time()} {work.parent.name} {step}\n".encode())
+
+    _steps(out, config.steps or 100, work / "state.json", resume, monitor, told)
 
 
 def chain(steps: int) -> str:

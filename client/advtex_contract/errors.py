@@ -14,6 +14,7 @@ class ErrorCode(StrEnum):
     bad_request = "bad_request"
     invalid_options = "invalid_options"
     invalid_scan = "invalid_scan"
+    invalid_source = "invalid_source"
     unauthorized = "unauthorized"
     forbidden = "forbidden"
     not_found = "not_found"

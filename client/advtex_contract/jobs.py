@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from datetime import datetime
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
 from advtex_contract.errors import ErrorDetail
 from advtex_contract.options import JobOptions
 
 Label = Annotated[str, StringConstraints(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
+
+
+BatchId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")]
 
 
 class JobState(StrEnum):
@@ -31,17 +34,27 @@ TERMINAL = frozenset({JobState.succeeded, JobState.failed, JobState.canceled, Jo
 
 
 class JobSpec(BaseModel):
-    """Body of `POST /v1/jobs`: texture the scan of a finished upload."""
+    """Body of `POST /v1/jobs`: texture the scan of a finished upload, or one that lies where the server can read it."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    upload_id: str
+    upload_id: str | None = None
+    source: str | None = Field(
+        default=None, max_length=2000, description="file:// or s3:// URL below a root that the operator allowed"
+    )
     options: JobOptions = JobOptions()
     label: Label = ""
+    batch: BatchId | None = Field(default=None, description="a name of your own for jobs that belong together")
     priority: int = Field(default=0, ge=-100, le=100, description="larger runs earlier, among your own jobs")
     retention_seconds: int | None = Field(
         default=None, ge=60, description="how long the job is kept after its end; the server's usual time if left out"
     )
+
+    @model_validator(mode="after")
+    def _one_scan(self) -> Self:
+        if (self.upload_id is None) == (self.source is None):
+            raise ValueError("give either upload_id or source")
+        return self
 
 
 class Progress(BaseModel):
@@ -97,6 +110,8 @@ class JobView(BaseModel):
     state: JobState
     label: str = ""
     upload_id: str
+    source: str | None = None
+    batch: str | None = None
     options: JobOptions
     priority: int = 0
     attempt: int = 0
@@ -119,6 +134,32 @@ class JobPage(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     jobs: list[JobView]
+    next_cursor: str | None = None
+
+
+class BatchView(BaseModel):
+    """Jobs with a common name.
+
+    eta_seconds: until all have ended, at the step rates that were measured; null while nothing was, and in lists.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    id: str
+    jobs: int
+    states: dict[JobState, int]
+    finished: bool
+    eta_seconds: float | None = None
+    created_at: datetime
+    updated_at: datetime
+
+
+class BatchPage(BaseModel):
+    """A page of batches, newest first; `next_cursor` is null on the last one."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    batches: list[BatchView]
     next_cursor: str | None = None
 
 

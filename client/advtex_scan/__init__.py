@@ -8,6 +8,7 @@ with open_scan("scan.zip") as archive:
 print(check_scan("scan.zip").format_text())
 """
 
+from advtex_scan._names import unsafe_reason
 from advtex_scan._zip_directory import ArchiveLimits
 from advtex_scan.archive import ScanArchive, open_scan
 from advtex_scan.check import CheckReport, ScanReading, check_scan, read_scan
@@ -63,4 +64,5 @@ __all__ = [
     "open_scan",
     "read_image_header",
     "read_scan",
+    "unsafe_reason",
 ]

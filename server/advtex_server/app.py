@@ -16,7 +16,7 @@ from advtex_server.bodies import OpenBodies
 from advtex_server.dispatch import Dispatcher
 from advtex_server.intake import Intake
 from advtex_server.metrics import Metrics, MetricsMiddleware
-from advtex_server.routes import health, jobs, uploads
+from advtex_server.routes import batches, health, jobs, uploads
 from advtex_server.service import Service
 from advtex_server.settings import ServerSettings
 from advtex_server.tus import TusMiddleware
@@ -65,7 +65,7 @@ def create_app(settings: ServerSettings) -> FastAPI:
     app.add_middleware(AccessMiddleware, accounts=store.accounts, max_body_bytes=settings.max_body_bytes)
     app.add_middleware(TusMiddleware)
     app.add_middleware(MetricsMiddleware, metrics=metrics)
-    for module in (uploads, jobs, health):
+    for module in (uploads, jobs, batches, health):
         app.include_router(module.router)
     return app
 

@@ -20,6 +20,7 @@ from advtex_store import errors as store
 
 STORE_CODES: Mapping[type[store.StoreError], ErrorCode] = {
     store.RecordNotFound: ErrorCode.not_found,
+    store.ReferenceRefused: ErrorCode.invalid_source,
     store.BlobNotFound: ErrorCode.not_found,
     store.IllegalTransition: ErrorCode.conflict,
     store.StaleAttempt: ErrorCode.conflict,

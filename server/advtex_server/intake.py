@@ -90,8 +90,15 @@ class Intake:
 
     def offset(self, owner: str, upload_id: str) -> UploadRow:
         """The row, with an offset that no older request will move any more."""
-        row = self.store.uploads.upload(upload_id, owner)
+        row = self.upload(owner, upload_id)
         return row if row.sha256 is not None else self.store.uploads.seize(upload_id, owner)
+
+    def upload(self, owner: str, upload_id: str) -> UploadRow:
+        """A row that takes bytes, or took them."""
+        row = self.store.uploads.upload(upload_id, owner)
+        if row.source is not None:
+            raise ApiError(ErrorCode.conflict, f"upload {row.id} is held by reference: it takes no bytes")
+        return row
 
     def view(self, owner: str, upload_id: str) -> UploadView:
         return upload_view(self.store.uploads.upload(upload_id, owner))

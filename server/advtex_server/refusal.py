@@ -10,6 +10,7 @@ STATUS: Mapping[ErrorCode, int] = {
     ErrorCode.bad_request: 400,
     ErrorCode.invalid_options: 422,
     ErrorCode.invalid_scan: 422,
+    ErrorCode.invalid_source: 422,
     ErrorCode.unauthorized: 401,
     ErrorCode.forbidden: 403,
     ErrorCode.not_found: 404,

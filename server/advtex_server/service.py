@@ -25,18 +25,19 @@ from advtex_contract.jobs import (
 )
 from advtex_contract.options import JobOptions
 from advtex_scan.check import check_scan
+from advtex_server.batches import BatchService
 from advtex_server.refusal import ApiError
 from advtex_server.settings import ServerSettings
 from advtex_store import keys
 from advtex_store.accounts import Caller
 from advtex_store.blobs import FolderBlobs
-from advtex_store.errors import BlobNotFound
-from advtex_store.models import JobRow, UploadRow
+from advtex_store.errors import BlobNotFound, ReferenceRefused
+from advtex_store.models import JobRow
 from advtex_store.needs import needed_memory
 from advtex_store.records import WAITING
 from advtex_store.results import StoredFile
 from advtex_store.store import Store
-from advtex_store.submissions import Reservation
+from advtex_store.submissions import JobFilter, Reservation
 
 IN_LINE = "a worker takes it when its turn comes"
 
@@ -50,6 +51,7 @@ class Service:
         self.store = store
         self.settings = settings
         self.wake = wake
+        self.batches = BatchService(store, wake)
 
     def storage(self) -> StorageInfo:
         return StorageInfo(
@@ -86,8 +88,8 @@ class Service:
     def job(self, owner: str, job_id: str) -> JobView:
         return job_view(self.store.records.job(job_id, owner))
 
-    def jobs(self, owner: str, state: JobState | None, label: str | None, cursor: str | None, limit: int) -> JobPage:
-        rows, following = self.store.submissions.list_jobs(owner, state=state, label=label, cursor=cursor, limit=limit)
+    def jobs(self, owner: str, wanted: JobFilter, cursor: str | None, limit: int) -> JobPage:
+        rows, following = self.store.submissions.list_jobs(owner, wanted, cursor=cursor, limit=limit)
         return JobPage(jobs=[job_view(row) for row in rows], next_cursor=following)
 
     def cancel(self, owner: str, job_id: str) -> JobView:
@@ -119,10 +121,7 @@ class Service:
 
     def _checked_job(self, caller: Caller, spec: JobSpec, reservation: Reservation | None) -> JobRow:
         owner = caller.owner
-        upload = self.store.uploads.upload(spec.upload_id, owner)
-        if upload.sha256 is None:
-            raise ApiError(ErrorCode.not_ready, f"upload {upload.id} is not complete: {upload.offset} of {upload.size}")
-        with self._local_scan(upload) as path:
+        with self._local_scan(owner, spec) as path:
             report = check_scan(path)
         details = [
             ErrorDetail(severity=f.severity, code=f.code, where=f.where, message=f.message, remedy=f.remedy)
@@ -141,18 +140,35 @@ class Service:
         return self.store.submissions.create_job(owner, spec, rejection=rejection, reservation=reservation)
 
     @contextmanager
-    def _local_scan(self, upload: UploadRow) -> Iterator[Path]:
-        blobs, key = self.store.blobs, keys.scan_key(upload.id)
-        if isinstance(blobs, FolderBlobs):
-            if not blobs.exists(key):
-                raise BlobNotFound(key)
-            yield blobs.path(key)
-            return
+    def _local_scan(self, owner: str, spec: JobSpec) -> Iterator[Path]:
+        """The scan as a file or folder of this machine."""
+        blobs = self.store.blobs
         blobs.spool_dir.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=blobs.spool_dir) as folder:
-            path = Path(folder) / "scan.zip"
-            blobs.fetch(key, path)
-            yield path
+        with tempfile.TemporaryDirectory(suffix=".part", dir=blobs.spool_dir) as folder:
+            if spec.source is not None:
+                yield self._referred(spec.source, Path(folder))
+                return
+            assert spec.upload_id is not None
+            upload = self.store.uploads.upload(spec.upload_id, owner)
+            if upload.sha256 is None:
+                state = f"{upload.offset} of {upload.size}"
+                raise ApiError(ErrorCode.not_ready, f"upload {upload.id} is not complete: {state}")
+            key = keys.scan_key(upload.id)
+            if not isinstance(blobs, FolderBlobs):
+                blobs.fetch(key, Path(folder) / "scan.zip")
+                yield Path(folder) / "scan.zip"
+            elif blobs.exists(key):
+                yield blobs.path(key)
+            else:
+                raise BlobNotFound(key)
+
+    def _referred(self, source: str, folder: Path) -> Path:
+        try:
+            return self.store.references.fetch(source, folder)
+        except (BlobNotFound, ReferenceRefused) as error:
+            remedy = "give the URL of a scan that the server can read, or upload it"
+            detail = ErrorDetail(code="source", where="body.source", message=str(error), remedy=remedy)
+            raise ApiError(ErrorCode.invalid_source, str(error), [detail]) from error
 
 
 def _rejection(details: list[ErrorDetail]) -> JobError:
@@ -181,6 +197,8 @@ def job_view(row: JobRow) -> JobView:
         state=state,
         label=row.label,
         upload_id=row.upload_id,
+        source=row.source,
+        batch=row.batch,
         options=JobOptions.model_validate(row.options),
         priority=row.priority,
         attempt=row.attempt - 1 if state in WAITING else row.attempt,

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import shutil
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
@@ -152,10 +153,14 @@ class Blobs(ABC):
         return stat.f_bavail * stat.f_frsize
 
     def clear_spool(self, older_than: float) -> None:
-        """Remove leftovers of killed writers, untouched since `older_than` (seconds since 1970)."""
+        """Remove leftovers of killed processes, untouched since `older_than` (seconds since 1970)."""
         for path in self.spool_dir.glob("*.part"):
             with suppress(FileNotFoundError):
-                if path.stat().st_mtime < older_than:
+                if path.stat().st_mtime >= older_than:
+                    continue
+                if path.is_dir():
+                    shutil.rmtree(path)
+                else:
                     path.unlink()
 
     @abstractmethod

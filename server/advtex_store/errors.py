@@ -8,6 +8,7 @@ StoreError
 ├── IdempotencyMismatch   the same key came with another body
 ├── IdempotencyInFlight   the same key is being worked on right now
 ├── QuotaExceeded         the owner has as much as the key allows
+├── ReferenceRefused      a scan's URL is malformed, or lies where nothing may be read
 ├── BlobNotFound
 ├── BlobsUnavailable      the storage cannot be reached now
 └── NoSpace               the disk is full; nothing was kept
@@ -46,6 +47,10 @@ class IdempotencyInFlight(StoreError):
 
 class QuotaExceeded(StoreError):
     """The owner has as many jobs or bytes as the key allows."""
+
+
+class ReferenceRefused(StoreError):
+    """A scan's URL is malformed, or lies where nothing may be read."""
 
 
 class BlobNotFound(StoreError):

@@ -38,7 +38,7 @@ class UploadRow(Base):
 
     offset: bytes that are durable. holder: the newest request for the bytes; only that one may move the offset.
     announced_sha256: what the client says that the bytes will have; the bytes' own once they are complete.
-    tus_metadata: as the client gave it.
+    tus_metadata: as the client gave it. source: as in its job.
     """
 
     __tablename__ = "uploads"
@@ -67,6 +67,7 @@ class JobRow(Base):
     version: grows by one with every change that a user can see; the ids of `EventRow`.
     reached, reached_at_claim, deaths: how far any attempt got, where this one began, and how many attempts in a row
     died without getting farther.
+    source: the URL of a scan that stays where it is; its upload row is a mere placeholder.
     memory_bytes: what a worker must have (`needs.py`). waiting_reason: the dispatcher's, for people.
     tidied_at: when what no result needs was removed.
     """
@@ -76,6 +77,7 @@ class JobRow(Base):
     id: Mapped[str] = mapped_column(primary_key=True)
     owner: Mapped[str]
     upload_id: Mapped[str] = mapped_column(ForeignKey("uploads.id"), index=True)
+    source: Mapped[str | None] = mapped_column(Text)
     batch: Mapped[str | None]
     state: Mapped[str] = mapped_column(String(16))
     label: Mapped[str] = mapped_column(default="")

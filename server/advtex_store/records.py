@@ -77,6 +77,7 @@ class Claim:
     owner: str
     upload_id: str
     scan_key: str
+    source: str | None
     options: JobOptions
     lease: Lease
 
@@ -109,6 +110,7 @@ class Records:
                 owner=row.owner,
                 upload_id=row.upload_id,
                 scan_key=keys.scan_key(row.upload_id),
+                source=row.source,
                 options=JobOptions.model_validate(row.options),
                 lease=Lease(expires_at, row.cancel_requested),
             )

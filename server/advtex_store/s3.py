@@ -26,9 +26,7 @@ class S3Blobs(Blobs):
         super().__init__(spool_dir)
         self.bucket = bucket
         self._multipart = S3Multipart(bucket, f"{prefix}/" if prefix else "")
-        self._store = S3Store(
-            bucket, prefix=prefix or None, client_options={"allow_http": True}, retry_config={"max_retries": 4}
-        )
+        self._store = _open(bucket, prefix)
 
     def put_if_absent(self, key: str, data: bytes) -> bool:
         try:
@@ -90,6 +88,36 @@ class S3Blobs(Blobs):
                 yield
         except BlobNotFound:
             raise BlobsUnavailable(f"there is no bucket {self.bucket!r}, or the keys do not open it") from None
+
+
+class BucketReader:
+    """Objects below a prefix of any bucket, by whatever names they have."""
+
+    def __init__(self, bucket: str, prefix: str) -> None:
+        self._store = _open(bucket, prefix)
+
+    def find(self, name: str) -> list[tuple[str, int]]:
+        """Name and size of the object itself, or else of all below it as of a folder; empty if there are none."""
+        try:
+            with _translated(name):
+                return [(name, obstore.head(self._store, name)["size"])]
+        except BlobNotFound:
+            with _translated(name):
+                pages = obstore.list(self._store, prefix=name)
+                return sorted((meta["path"], meta["size"]) for page in pages for meta in page)
+
+    def stream(self, name: str) -> Iterator[bytes]:
+        """The bytes of an object, in chunks."""
+        with _translated(name):
+            size = obstore.head(self._store, name)["size"]
+        for offset in range(0, size, PART):
+            with _translated(name):
+                chunk = bytes(obstore.get_range(self._store, name, start=offset, end=min(offset + PART, size)))
+            yield chunk
+
+
+def _open(bucket: str, prefix: str) -> S3Store:
+    return S3Store(bucket, prefix=prefix or None, client_options={"allow_http": True}, retry_config={"max_retries": 4})
 
 
 def _info(meta: obstore.ObjectMeta) -> BlobInfo:

@@ -31,6 +31,10 @@ class StoreSettings(BaseSettings):
     retention_seconds: int = Field(default=30 * 86400, gt=0, description="how long finished jobs and uploads are kept")
     max_retention_seconds: int = Field(default=90 * 86400, gt=0, description="the most that a job may ask for")
 
+    reference_roots: str = Field(
+        default="", description="URLs (file://, s3://), separated by blanks, below which scans may be referred to"
+    )
+
     @property
     def database(self) -> str:
         """The SQLAlchemy URL."""

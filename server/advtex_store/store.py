@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from advtex_store.accounts import Accounts
+from advtex_store.batches import Batches
 from advtex_store.blobs import Blobs, open_blobs
 from advtex_store.database import Database
 from advtex_store.queue import JobQueue, connect_redis
 from advtex_store.records import Records
+from advtex_store.references import References
 from advtex_store.results import Results
 from advtex_store.settings import StoreSettings
 from advtex_store.submissions import Submissions
@@ -25,7 +27,9 @@ class Store:
     uploads: Uploads
     submissions: Submissions
     accounts: Accounts
+    batches: Batches
     blobs: Blobs
+    references: References
     results: Results
     queue: JobQueue
 
@@ -48,7 +52,9 @@ def open_store(settings: StoreSettings) -> Store:
         uploads=Uploads(database, retention_seconds=retention),
         submissions=Submissions(database, retention_seconds=retention),
         accounts=Accounts(database),
+        batches=Batches(database),
         blobs=blobs,
+        references=References(settings.reference_roots.split()),
         results=Results(records, blobs),
         queue=JobQueue(connect_redis(settings)),
     )

@@ -33,6 +33,15 @@ class Reservation:
     holder: str
 
 
+@dataclass(frozen=True, slots=True)
+class JobFilter:
+    """Which jobs a list shows; None for any."""
+
+    state: JobState | None = None
+    label: str | None = None
+    batch: str | None = None
+
+
 class Submissions:
     """Jobs as users make and list them."""
 
@@ -101,22 +110,17 @@ class Submissions:
         with self.database.write() as session:
             if rejection is None:
                 check_active_jobs(session, owner, max_active_jobs)
-            upload = session.scalar(
-                select(UploadRow)
-                .where(UploadRow.id == spec.upload_id, UploadRow.owner == owner)
-                .where(UploadRow.deleted_at.is_(None), UploadRow.sha256.is_not(None))
-                .with_for_update()
-            )
-            if upload is None:
-                raise RecordNotFound(f"there is no finished upload {spec.upload_id}")
             now = self.database.now(session)
+            upload = _placeholder(session, owner, spec.source, now) if spec.source else _finished(session, owner, spec)
             # Also keeps a reconciler that is just letting the upload go from doing so: it looks at this time again.
             upload.expires_at = max(upload.expires_at or 0.0, now + retention)
             state = JobState.rejected if rejection else JobState.queued
             row = JobRow(
                 id=new_id(now),
                 owner=owner,
-                upload_id=spec.upload_id,
+                upload_id=upload.id,
+                source=spec.source,
+                batch=spec.batch,
                 state=state.value,
                 label=spec.label,
                 options=spec.options.model_dump(mode="json"),
@@ -150,23 +154,41 @@ class Submissions:
     def list_jobs(
         self,
         owner: str,
+        wanted: JobFilter = JobFilter(),
         *,
-        state: JobState | None = None,
-        label: str | None = None,
         cursor: str | None = None,
         limit: int = 50,
     ) -> tuple[list[JobRow], str | None]:
         """A page of jobs, newest first, and the cursor of the next page."""
         query = select(JobRow).where(JobRow.owner == owner, JobRow.deleted_at.is_(None))
-        if state is not None:
-            query = query.where(JobRow.state == state)
-        if label is not None:
-            query = query.where(JobRow.label == label)
+        for column, value in ((JobRow.state, wanted.state), (JobRow.label, wanted.label), (JobRow.batch, wanted.batch)):
+            if value is not None:
+                query = query.where(column == value)
         if cursor is not None:
             query = query.where(JobRow.id < cursor)
         with self.database.read() as session:
             rows = list(session.scalars(query.order_by(JobRow.id.desc()).limit(limit + 1)))
         return rows[:limit], rows[limit - 1].id if len(rows) > limit else None
+
+
+def _finished(session: Session, owner: str, spec: JobSpec) -> UploadRow:
+    upload = session.scalar(
+        select(UploadRow)
+        .where(UploadRow.id == spec.upload_id, UploadRow.owner == owner)
+        .where(UploadRow.deleted_at.is_(None), UploadRow.sha256.is_not(None))
+        .with_for_update()
+    )
+    if upload is None:
+        raise RecordNotFound(f"there is no finished upload {spec.upload_id}")
+    return upload
+
+
+def _placeholder(session: Session, owner: str, source: str, now: float) -> UploadRow:
+    name = source.rstrip("/").rpartition("/")[2]
+    upload = UploadRow(id=new_id(now), owner=owner, size=0, filename=name[:255], source=source, created_at=now)
+    session.add(upload)
+    session.flush()
+    return upload
 
 
 def _bind(session: Session, reservation: Reservation, job_id: str) -> None:

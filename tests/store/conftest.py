@@ -9,6 +9,7 @@ import pytest
 
 from advtex_contract.jobs import JobSpec
 from advtex_store.accounts import Accounts
+from advtex_store.batches import Batches
 from advtex_store.database import Database
 from advtex_store.records import Records
 from advtex_store.submissions import Submissions
@@ -37,12 +38,14 @@ class Bench:
     records: Records = field(init=False)
     uploads: Uploads = field(init=False)
     submissions: Submissions = field(init=False)
+    batches: Batches = field(init=False)
     accounts: Accounts = field(init=False)
 
     def __post_init__(self) -> None:
         self.records = Records(self.database, lease_seconds=60)
         self.uploads = Uploads(self.database, retention_seconds=1000)
         self.submissions = Submissions(self.database, retention_seconds=1000)
+        self.batches = Batches(self.database)
         self.accounts = Accounts(self.database)
 
     def finished_upload(self, owner: str = OWNER) -> str:
@@ -50,7 +53,8 @@ class Bench:
         return self.uploads.finish(row.id, "ab" * 32).id
 
     def job(self, owner: str = OWNER, **spec: object) -> str:
-        spec.setdefault("upload_id", self.finished_upload(owner))
+        if "source" not in spec:
+            spec.setdefault("upload_id", self.finished_upload(owner))
         return self.submissions.create_job(owner, JobSpec.model_validate(spec)).id
 
     def state(self, job_id: str) -> tuple[str, int]:

@@ -9,7 +9,7 @@ import pytest
 
 from advtex_contract.jobs import JobError, JobSpec, JobState
 from advtex_store.errors import IdempotencyInFlight, IdempotencyMismatch, RecordNotFound
-from advtex_store.submissions import HOLD_SECONDS, Reservation
+from advtex_store.submissions import HOLD_SECONDS, JobFilter, Reservation
 
 
 def test_a_job_needs_a_finished_upload_of_its_owner(bench: Any) -> None:
@@ -40,7 +40,9 @@ def test_pages_show_every_job_once_newest_first(bench: Any) -> None:
     made = []
     for number in range(7):
         bench.clock.now += 1
-        made.append(bench.job(upload_id=upload, label="odd" if number % 2 else "even"))
+        made.append(
+            bench.job(upload_id=upload, label="odd" if number % 2 else "even", batch="b" if number < 2 else None)
+        )
     bench.job("somebody else")
     bench.records.cancel(made[3])
     seen: list[str] = []
@@ -53,11 +55,14 @@ def test_pages_show_every_job_once_newest_first(bench: Any) -> None:
     assert seen == made[::-1]
 
     def listed(**filters: object) -> list[str]:
-        return [row.id for row in bench.submissions.list_jobs(bench.owner, **filters)[0]]
+        return [row.id for row in bench.submissions.list_jobs(bench.owner, JobFilter(**filters))[0]]
 
     assert listed(state=JobState.canceled) == [made[3]]
     assert listed(label="odd") == made[5::-2]
     assert listed(label="odd", state=JobState.queued) == [made[5], made[1]]
+    assert listed(batch="b") == [made[1], made[0]]
+    assert listed(batch="b", label="odd") == [made[1]]
+    assert listed(batch="c") == []
     bench.records.delete(made[3])
     assert made[3] not in listed()
 

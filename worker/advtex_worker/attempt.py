@@ -19,7 +19,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from advtex_contract.errors import ErrorDetail
 from advtex_contract.jobs import JobError
 from advtex_store import keys
-from advtex_store.errors import BlobNotFound, StaleAttempt, StoreError
+from advtex_store.errors import BlobNotFound, ReferenceRefused, StaleAttempt, StoreError
 from advtex_store.records import Claim
 from advtex_store.store import Store
 from advtex_worker.checkpoints import CheckpointUploader, restore
@@ -121,6 +121,7 @@ class Attempt:
         self._number = claim.attempt
         self._claim = claim
         self._space = Workspace(settings.workspaces / f"{WORKSPACE}{claim.job_id}-{claim.attempt}")
+        self._scan = self._space.scan
         self._keeper = LeaseKeeper(
             store.records,
             claim.job_id,
@@ -163,9 +164,9 @@ class Attempt:
     def _run(self) -> None:
         try:
             self._persist(self._fetch_scan)
-        except BlobNotFound:
+        except (BlobNotFound, ReferenceRefused) as missing:
             message = "the scan is no longer stored; submit it again"
-            error = JobError(code="scan_missing", message=message)
+            error = JobError(code="scan_missing", message=str(missing) if self._claim.source else message)
             self._record(lambda: self._store.records.fail(self._job_id, self._number, error))
             return
         base = self._persist(lambda: restore(self._store.blobs, self._job_id, self._number, self._space.work))
@@ -188,17 +189,24 @@ class Attempt:
 
     def _fetch_scan(self) -> None:
         """In pieces, so that a cancel does not wait for gigabytes."""
-        with self._space.scan.open("wb") as file:
+        if self._claim.source is not None:
+            folder = self._space.root / "source"
+            self._scan = self._store.references.fetch(self._claim.source, folder, self._check_ending)
+            return
+        with self._scan.open("wb") as file:
             for chunk in self._store.blobs.stream(self._claim.scan_key):
                 file.write(chunk)
-                if self._keeper.ending:
-                    raise Interrupted
+                self._check_ending()
+
+    def _check_ending(self) -> None:
+        if self._keeper.ending:
+            raise Interrupted
 
     def _spawn(self, resume: bool) -> Child:
         space = self._space
         request = Request(
             engine=self._engine,
-            scan=space.scan,
+            scan=self._scan,
             out=space.out,
             work=space.work,
             snapshots=space.snapshots,
@@ -295,7 +303,7 @@ class Attempt:
         while True:
             try:
                 return action()
-            except (StaleAttempt, BlobNotFound):
+            except (StaleAttempt, BlobNotFound, ReferenceRefused):
                 raise
             except (OSError, StoreError, SQLAlchemyError) as error:
                 self._log.warning("storage is in trouble, trying again", error=f"{type(error).__name__}: {error}")

@@ -7,10 +7,11 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from advtex_contract.jobs import JobPage, JobSpec, JobState, JobView, Label
+from advtex_contract.jobs import BatchId, JobPage, JobSpec, JobState, JobView, Label
 from advtex_server.deps import Reader, TheService, Writer
 from advtex_server.events import stream_events
 from advtex_server.ranges import chosen_range
+from advtex_store.submissions import JobFilter
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
@@ -39,11 +40,12 @@ def list_jobs(
     service: TheService,
     state: JobState | None = None,
     label: Label | None = None,
+    batch: BatchId | None = None,
     cursor: Annotated[str | None, Query(pattern="^[0-9a-f]{1,64}$", description="`next_cursor` of a page")] = None,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
 ) -> JobPage:
     """Your jobs, newest first."""
-    return service.jobs(caller.owner, state, label, cursor, limit)
+    return service.jobs(caller.owner, JobFilter(state, label, batch), cursor, limit)
 
 
 @router.get("/{job_id}")

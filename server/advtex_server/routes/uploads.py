@@ -152,7 +152,7 @@ async def patch_upload(
         raise ApiError(ErrorCode.bad_request, f"the Content-Type must be {tus.OFFSET_STREAM}", status=415)
     offset = tus.whole_number("Upload-Offset", upload_offset)
     checksum = tus.parse_checksum(upload_checksum)
-    row = await run_in_threadpool(intake.store.uploads.upload, upload_id, caller.owner)
+    row = await run_in_threadpool(intake.upload, caller.owner, upload_id)
     view = await _receive(request, intake, row, offset, checksum)
     return Response(status_code=204, headers=_progress(view))
 
@@ -176,8 +176,6 @@ async def _receive(
     request: Request, intake: Intake, row: UploadRow, offset: int = 0, checksum: Checksum | None = None
 ) -> UploadView:
     """The body of a request that goes on with an upload at `offset`."""
-    if row.source is not None:
-        raise ApiError(ErrorCode.conflict, f"upload {row.id} is held by reference: it takes no bytes")
     length = request.headers.get("content-length", "0")
     async with _bodies(request).alone(row.id, PATIENCE) as body:
         row = await run_in_threadpool(intake.store.uploads.upload, row.id, row.owner)

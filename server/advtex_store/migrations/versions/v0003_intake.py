@@ -18,5 +18,6 @@ def upgrade() -> None:
     op.add_column("uploads", sa.Column("source", sa.Text(), nullable=True))
     op.create_index(op.f("ix_uploads_announced_sha256"), "uploads", ["announced_sha256"], unique=False)
     op.execute("update uploads set announced_sha256 = sha256")
+    op.add_column("jobs", sa.Column("source", sa.Text(), nullable=True))
     op.add_column("jobs", sa.Column("batch", sa.String(length=255), nullable=True))
     op.create_index("ix_jobs_owner_batch_id", "jobs", ["owner", "batch", "id"], unique=False)

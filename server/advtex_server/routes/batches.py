@@ -1,0 +1,43 @@
+"""Batches: jobs with a common name, which the client chose when it made them."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Path, Query
+
+from advtex_contract.jobs import BatchPage, BatchView
+from advtex_server.deps import Reader, TheService, Writer
+
+router = APIRouter(prefix="/v1/batches", tags=["batches"])
+
+BatchName = Annotated[str, Path(max_length=100)]
+
+
+@router.get("")
+def list_batches(
+    caller: Reader,
+    service: TheService,
+    cursor: Annotated[str | None, Query(pattern="^[0-9a-f]{1,64}$", description="`next_cursor` of a page")] = None,
+    limit: Annotated[int, Query(ge=1, le=200)] = 50,
+) -> BatchPage:
+    """Your batches, newest first; `eta_seconds` is left out."""
+    return service.batches.page(caller.owner, cursor, limit)
+
+
+@router.get("/{batch_id}")
+def get_batch(batch_id: BatchName, caller: Reader, service: TheService) -> BatchView:
+    """How many jobs are in which state, and how long the rest takes at the step rates that were measured."""
+    return service.batches.view(caller.owner, batch_id)
+
+
+@router.post("/{batch_id}/cancel")
+def cancel_batch(batch_id: BatchName, caller: Writer, service: TheService) -> BatchView:
+    """Cancel every job that has not ended."""
+    return service.batches.cancel(caller.owner, batch_id)
+
+
+@router.post("/{batch_id}/retry-failed")
+def retry_batch(batch_id: BatchName, caller: Writer, service: TheService) -> BatchView:
+    """Queue every failed job again; each goes on from its checkpoint."""
+    return service.batches.retry_failed(caller, batch_id)

@@ -1,0 +1,132 @@
+"""Scans that stay where they are: `file://` and `s3://` URLs below the roots that the operator allowed.
+
+Server and workers must see the same things there. Nothing outside of the roots is ever looked at: a path is resolved
+first, symbolic links included, and only then compared; keys of object storage have no links, and no `..` either.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import unquote, urlsplit
+
+from advtex_scan import ArchiveLimits, unsafe_reason
+from advtex_store.errors import BlobNotFound, ReferenceRefused
+from advtex_store.files import translated
+
+if TYPE_CHECKING:
+    from advtex_store.s3 import BucketReader
+
+_BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """A URL, taken apart. `parts`: of the path or key, without empty ones, `.` and `..`."""
+
+    scheme: str
+    bucket: str
+    parts: tuple[str, ...]
+
+    @property
+    def path(self) -> Path:
+        return Path("/", *self.parts)
+
+    def below(self, root: _Place) -> bool:
+        same = (self.scheme, self.bucket) == (root.scheme, root.bucket)
+        return same and self.parts[: len(root.parts)] == root.parts
+
+
+class References:
+    """`roots`: URLs of folders, or of buckets and prefixes."""
+
+    def __init__(self, roots: Sequence[str]) -> None:
+        self.roots = tuple(roots)
+        self._roots = tuple(_resolved(_parse(root)) for root in roots)
+
+    def fetch(self, url: str, folder: Path, check: Callable[[], None] = lambda: None) -> Path:
+        """The scan on this machine: in place for `file://`, else copied below `folder`.
+
+        ReferenceRefused for what is not allowed or no URL; BlobNotFound if there is nothing. check: called between
+        pieces, may raise to end it.
+        """
+        place = self._allowed(url)
+        if place.scheme == "file":
+            if not place.path.exists():
+                raise BlobNotFound(f"there is nothing at {url}")
+            return place.path
+        return _copy(place, url, folder, check)
+
+    def _allowed(self, url: str) -> _Place:
+        place = _parse(url)
+        # Compared before and after links are followed, so that nothing can be learned about what lies outside.
+        if any(place.below(root) for root in (*self._roots, *map(_parse, self.roots))):
+            resolved = _resolved(place)
+            if any(resolved.below(root) for root in self._roots):
+                return resolved
+        allowed = f"allowed is what lies below {', '.join(self.roots)}" if self.roots else "the operator allowed none"
+        raise ReferenceRefused(f"{url} is not a place that scans may be read from: {allowed}")
+
+
+def _parse(url: str) -> _Place:
+    try:
+        parts = urlsplit(url)
+        host = parts.netloc
+    except ValueError:
+        raise ReferenceRefused(f"{url!r} is no URL") from None
+    if parts.query or parts.fragment or "?" in url or "#" in url:
+        raise ReferenceRefused(f"{url}: '?' and '#' are not part of a scan's URL; write them as %3F and %23")
+    if parts.scheme not in ("file", "s3"):
+        raise ReferenceRefused(f"{url}: a scan is referred to by file:///folder or s3://bucket/prefix")
+    if parts.scheme == "file" and host not in ("", "localhost"):
+        raise ReferenceRefused(f"{url}: file:// URLs have three slashes and no host")
+    if parts.scheme == "s3" and not _BUCKET.fullmatch(host):
+        raise ReferenceRefused(f"{url}: {host!r} is no name of a bucket")
+    name = unquote(parts.path, errors="surrogateescape").strip("/")
+    if name and (reason := unsafe_reason(name)) is not None:
+        raise ReferenceRefused(f"{url}: {reason}")
+    return _Place(parts.scheme, host if parts.scheme == "s3" else "", tuple(name.split("/")) if name else ())
+
+
+def _resolved(place: _Place) -> _Place:
+    if place.scheme != "file":
+        return place
+    try:
+        path = place.path.resolve()
+    except (OSError, RuntimeError):  # a loop of links
+        raise ReferenceRefused(f"{place.path.as_uri()} cannot be resolved") from None
+    return _Place("file", "", path.parts[1:])
+
+
+def _copy(place: _Place, url: str, folder: Path, check: Callable[[], None]) -> Path:
+    from advtex_store.s3 import BucketReader
+
+    if not place.parts:
+        raise ReferenceRefused(f"{url} is a whole bucket: name a scan in it")
+    *parents, name = place.parts
+    bucket = BucketReader(place.bucket, "/".join(parents))
+    found = bucket.find(name)
+    limits = ArchiveLimits()
+    if not found:
+        raise BlobNotFound(f"there is nothing at {url}")
+    if len(found) > limits.entries or sum(size for _, size in found) > limits.total_bytes:
+        raise ReferenceRefused(f"{url} is no scan: it holds {len(found)} objects, {sum(s for _, s in found)} bytes")
+    for key, _ in found:
+        if (reason := unsafe_reason(key)) is not None:
+            raise ReferenceRefused(f"{url} holds {key!r}: {reason}")
+        try:
+            _download(bucket, key, folder / key, check)
+        except OSError as error:
+            raise translated(error) from error
+    return folder / name
+
+
+def _download(bucket: BucketReader, key: str, target: Path, check: Callable[[], None]) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with target.open("wb") as file:
+        for chunk in bucket.stream(key):
+            file.write(chunk)
+            check()

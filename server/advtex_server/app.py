@@ -13,13 +13,15 @@ from advtex_contract.errors import ErrorBody
 from advtex_server import errors
 from advtex_server.access import AccessMiddleware
 from advtex_server.bodies import OpenBodies
+from advtex_server.deliveries import Deliverer
 from advtex_server.dispatch import Dispatcher
 from advtex_server.intake import Intake
 from advtex_server.metrics import Metrics, MetricsMiddleware
-from advtex_server.routes import batches, health, jobs, uploads
+from advtex_server.routes import batches, health, jobs, uploads, webhooks
 from advtex_server.service import Service
 from advtex_server.settings import ServerSettings
 from advtex_server.tus import TusMiddleware
+from advtex_server.webhooks import WebhookService
 from advtex_store.database import upgrade_database
 from advtex_store.store import open_store
 
@@ -31,17 +33,19 @@ def create_app(settings: ServerSettings) -> FastAPI:
     """
     store = open_store(settings)
     dispatcher = Dispatcher(store, settings)
+    deliverer = Deliverer(store.webhooks, settings)
     metrics = Metrics()
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         await asyncio.to_thread(upgrade_database, settings.database)
-        task = asyncio.create_task(dispatcher.run())
+        tasks = [asyncio.create_task(dispatcher.run()), asyncio.create_task(deliverer.run())]
         yield
         app.state.stopping.set()
-        task.cancel()
-        with suppress(asyncio.CancelledError):
-            await task
+        for task in tasks:
+            task.cancel()
+            with suppress(asyncio.CancelledError):
+                await task
         store.close()
 
     app = FastAPI(
@@ -57,6 +61,7 @@ def create_app(settings: ServerSettings) -> FastAPI:
         redoc_url=None,
     )
     app.state.service = Service(store, settings, dispatcher.wake)
+    app.state.webhooks = WebhookService(store.webhooks, deliverer.rules)
     app.state.metrics = metrics
     app.state.stopping = asyncio.Event()
     app.state.intake = Intake(store, settings)
@@ -65,7 +70,7 @@ def create_app(settings: ServerSettings) -> FastAPI:
     app.add_middleware(AccessMiddleware, accounts=store.accounts, max_body_bytes=settings.max_body_bytes)
     app.add_middleware(TusMiddleware)
     app.add_middleware(MetricsMiddleware, metrics=metrics)
-    for module in (uploads, jobs, batches, health):
+    for module in (webhooks, uploads, jobs, batches, health):
         app.include_router(module.router)
     return app
 

@@ -11,6 +11,7 @@ from advtex_contract.errors import ErrorCode
 from advtex_server.intake import Intake
 from advtex_server.refusal import ApiError
 from advtex_server.service import Service
+from advtex_server.webhooks import WebhookService
 from advtex_store.accounts import Caller
 
 # Only for the API's description: AccessMiddleware has checked the key before any route is entered.
@@ -24,6 +25,10 @@ def _service(request: Request) -> Service:
 
 def _intake(request: Request) -> Intake:
     return cast(Intake, request.app.state.intake)
+
+
+def _webhooks(request: Request) -> WebhookService:
+    return cast(WebhookService, request.app.state.webhooks)
 
 
 def reader(request: Request, _key: _Key) -> Caller:
@@ -46,4 +51,5 @@ def _with_scope(request: Request, scope: str) -> Caller:
 Reader = Annotated[Caller, Depends(reader)]
 Writer = Annotated[Caller, Depends(writer)]
 TheIntake = Annotated[Intake, Depends(_intake)]
+TheWebhooks = Annotated[WebhookService, Depends(_webhooks)]
 TheService = Annotated[Service, Depends(_service)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from pydantic import Field, IPvAnyNetwork
 
 from advtex_store.settings import StoreSettings
 
@@ -17,4 +17,8 @@ class ServerSettings(StoreSettings):
     dispatch_seconds: float = Field(default=1.0, gt=0, description="between looks at waiting jobs")
     reconcile_seconds: float = Field(default=10.0, gt=0, description="between looks at leases and old blobs")
     queue_depth: int = Field(default=1, gt=0, description="attempts that wait in Redis, per worker")
+    webhook_allow_http: bool = Field(default=False, description="webhooks may go to http:// addresses")
+    webhook_networks: tuple[IPvAnyNetwork, ...] = Field(
+        default=(), description="networks that are not public and that webhooks may go to, as a JSON list"
+    )
     shutdown_seconds: int = Field(default=5, gt=0, description="open requests get this long when the server stops")

@@ -43,6 +43,7 @@ from advtex_store.accounts import check_active_jobs
 from advtex_store.database import Database
 from advtex_store.errors import IllegalTransition, RecordNotFound, StaleAttempt
 from advtex_store.models import EventRow, JobRow
+from advtex_store.webhooks import tell_webhooks
 
 S = JobState
 TRANSITIONS: Mapping[JobState, frozenset[JobState]] = {
@@ -358,6 +359,7 @@ class Records:
         if row is None:
             raise IllegalTransition(f"job {job_id} is {self._get(session, job_id, None).state}, it cannot become {to}")
         _record(session, row, "state", {"state": to.value, "attempt": row.attempt, "at": now})
+        tell_webhooks(session, row, now)
         return row
 
     def _finish(self, session: Session, row: JobRow, **values: Any) -> JobRow:

@@ -15,6 +15,7 @@ from advtex_store.results import Results
 from advtex_store.settings import StoreSettings
 from advtex_store.submissions import Submissions
 from advtex_store.uploads import Uploads
+from advtex_store.webhooks import Webhooks
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +32,7 @@ class Store:
     blobs: Blobs
     references: References
     results: Results
+    webhooks: Webhooks
     queue: JobQueue
 
     def close(self) -> None:
@@ -56,5 +58,6 @@ def open_store(settings: StoreSettings) -> Store:
         blobs=blobs,
         references=References(settings.reference_roots.split()),
         results=Results(records, blobs),
+        webhooks=Webhooks(database),
         queue=JobQueue(connect_redis(settings)),
     )

@@ -20,6 +20,7 @@ from advtex_store.database import Database
 from advtex_store.errors import IdempotencyInFlight, IdempotencyMismatch, RecordNotFound
 from advtex_store.ids import new_id
 from advtex_store.models import EventRow, IdempotencyRow, JobRow, UploadRow
+from advtex_store.webhooks import tell_webhooks
 
 HOLD_SECONDS = 300.0
 
@@ -147,6 +148,7 @@ class Submissions:
                     data={"kind": "state", "state": state.value, "attempt": row.attempt, "at": now},
                 )
             )
+            tell_webhooks(session, row, now)
             if reservation is not None:
                 _bind(session, reservation, row.id)
             return row

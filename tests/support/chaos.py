@@ -16,7 +16,7 @@ from itertools import pairwise
 
 import fake_engines
 import httpx
-from fleet import Fleet, kill_tree
+from fleet import Fleet, is_up, kill_tree
 from live_service import process_tree
 
 from advtex_contract.jobs import TERMINAL, JobState
@@ -69,6 +69,7 @@ class Chaos:
         self._random.shuffle(order)
         try:
             while not self._done.wait(self._random.uniform(0.2, 1.5)):
+                self._wait_for_a_server()
                 chosen = order.pop() if order else self._random.choices(*zip(*self._actions.items(), strict=True))[0]
                 chosen()
                 self.done[chosen.__name__] += 1
@@ -77,6 +78,11 @@ class Chaos:
             self.failure = error
         finally:
             self._revive()
+
+    def _wait_for_a_server(self) -> None:
+        """On a busy machine, servers would else be killed again and again before they have started."""
+        while not self._done.is_set() and not any(is_up(url) for url in self._fleet.urls):
+            self._done.wait(0.1)
 
     # -- faults -------------------------------------------------------------------------------------------------
 
@@ -152,7 +158,7 @@ class Chaos:
 def insist(fleet: Fleet, key: str, method: str, path: str, **request: object) -> httpx.Response:
     """Send it until some server has answered it, as the clients do: what comes twice carries an idempotency key."""
     headers = {"Authorization": f"Bearer {key}", **request.pop("headers", {})}  # type: ignore[dict-item]
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 300
     number = 0
     while time.monotonic() < deadline:
         number += 1

@@ -75,7 +75,7 @@ class Fleet:
         self.servers = [self.start_server(number) for number in range(len(self.ports))]
         self.workers = [self.start_worker(number) for number in range(self._workers)]
         for url in self.urls:
-            wait_until(lambda: _is_up(url), seconds=30)  # noqa: B023
+            wait_until(lambda: is_up(url), seconds=30)  # noqa: B023
 
     @property
     def urls(self) -> list[str]:
@@ -158,7 +158,8 @@ def kill_tree(pid: int) -> None:
             os.kill(found, signal.SIGKILL)
 
 
-def _is_up(url: str) -> bool:
+def is_up(url: str) -> bool:
+    """Whether the server answers."""
     try:
         return httpx.get(f"{url}/healthz", timeout=5).status_code == 200
     except httpx.HTTPError:

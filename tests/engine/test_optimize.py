@@ -77,9 +77,19 @@ def test_a_batch_is_what_its_crop_shows() -> None:
     assert visible.mean() > 0.9
 
 
-def test_one_step_is_adam_on_the_printed_losses() -> None:
+def responses(network: PatchDiscriminator, condition: torch.Tensor, residual: torch.Tensor) -> list[torch.Tensor]:
+    """Plain twin of the discriminator's features."""
+    layers, x = [], torch.cat((condition, residual), 1)
+    for layer in list(network.convolutions)[:-1]:
+        x = torch.where((y := layer(x)) > 0, y, 0.2 * y)
+        layers.append(x)
+    return layers
+
+
+@pytest.mark.parametrize("feature_weight", [0.0, 30.0])
+def test_one_step_is_adam_on_the_printed_losses(feature_weight: float) -> None:
     """Against torch's plain (not fused) Adam and plain autograd over a dense image, without the compact sampling."""
-    of = optimizer()
+    of = optimizer(preset=dataclasses.replace(PRESET, feature_weight=feature_weight))
     twin_network = PatchDiscriminator(torch.Generator().manual_seed(0))
     values = of.values.detach().clone().requires_grad_(True)
     adam_texture = torch.optim.Adam([values], lr=1e-3, betas=(0.5, 0.999), foreach=False)
@@ -99,6 +109,10 @@ def test_one_step_is_adam_on_the_printed_losses() -> None:
         real_logits = twin_network(batch.condition, (batch.real - batch.condition) * batch.visible)
         adversarial = adversarial_loss(fake_logits, masks.texture)
         loss = adversarial + weight * l1_loss(fake, batch.real, batch.visible)
+        of_fake = responses(twin_network, batch.condition, (fake - batch.condition) * batch.visible)
+        of_real = responses(twin_network, batch.condition, (batch.real - batch.condition) * batch.visible)
+        for ours, theirs in zip(of_fake, of_real, strict=True):
+            loss = loss + feature_weight * (ours - theirs).abs().mean()
         of_network = discriminator_loss(real_logits, fake_logits, masks.discriminator)
         values.grad = torch.autograd.grad(loss, [values], retain_graph=True)[0]
         adam_network.zero_grad()
@@ -108,8 +122,8 @@ def test_one_step_is_adam_on_the_printed_losses() -> None:
         adam_network.step()
     # The first Adam steps are lr * sign(gradient): where a gradient is nearly zero, rounding may turn its sign.
     assert ((of.values - values).abs() > 1e-4).float().mean() < 2e-3
-    for ours, theirs in zip(of.parameters, twin_network.parameters(), strict=True):
-        assert ((ours - theirs).abs() > 2e-5).float().mean() < 1e-2
+    for parameter, twin in zip(of.parameters, twin_network.parameters(), strict=True):
+        assert ((parameter - twin).abs() > 2e-5).float().mean() < 1e-2
 
 
 def test_the_discriminator_rests_while_it_is_ahead() -> None:
@@ -153,7 +167,7 @@ def test_losses_are_means_since_the_last_call() -> None:
     of.step()
     of.step()
     first = of.drain_losses()
-    assert set(first) == {"discriminator", "adversarial", "l1", "skipped"}
+    assert set(first) == {"discriminator", "adversarial", "l1", "features", "skipped"}
     assert first["discriminator"] == pytest.approx(2 * 0.693, abs=0.05)
     assert of.drain_losses() == {}
 
@@ -211,3 +225,17 @@ def test_large_views_are_seen_in_parts() -> None:
     assert crop_size(640, 480) == (576, 416)
     assert crop_size(640, 480, (384, 288)) == (384, 288)
     assert crop_size(320, 240, (384, 288)) == (288, 208)
+
+
+def test_examples_are_aligned_with_the_source_before_they_are_judged() -> None:
+    of = optimizer(preset=dataclasses.replace(PRESET, alignment=True))
+    batch = of.draw()
+    moved = dataclasses.replace(batch, real=batch.condition.roll(2, -1), visible=torch.ones_like(batch.visible))
+    plain = optimizer(preset=PRESET)
+    inner = (..., slice(None), slice(8, -8))
+    real, fake, visible = of._align(moved, moved.real.clone().requires_grad_(True))
+    torch.testing.assert_close(real[inner], batch.condition[inner], atol=1e-3, rtol=0)
+    torch.testing.assert_close(fake, real)
+    assert fake.requires_grad
+    assert bool((visible == 1).all())
+    assert float(of.play(moved).l1.detach()) != float(plain.play(moved).l1.detach())

@@ -34,6 +34,9 @@ class Preset:
     l1_weight         lambda = 10 at the start
     l1_target         "auxiliary" (paper: the warped auxiliary image) or "start" (the start's own render)
     l1_decay          lambda is multiplied by this `l1_decays` times over the run (paper: 0.8 every 1,000 of 50,000)
+    feature_weight    of the distance between what the discriminator's layers respond to the render and to the real
+                      example (paper: 0); tolerant to shifts as they are, it averages less than L1 does
+    alignment         both examples are moved onto the source image before they are judged (Zhao et al. 2022)
     max_crop          largest crop (width, height) in pixels; larger views are seen in parts, for cheaper steps
     max_pair_angle    largest angle between the optical axes of a pair, degrees (released code: 15)
     min_pair_overlap  least share of the source's foreground that the auxiliary view sees
@@ -52,6 +55,8 @@ class Preset:
     l1_target: Literal["auxiliary", "start"] = "auxiliary"
     l1_decay: float = 0.8
     l1_decays: float = 50.0
+    feature_weight: float = 0.0
+    alignment: bool = False
     max_crop: tuple[int, int] | None = None
     max_pair_angle: float = 15.0
     min_pair_overlap: float = 0.3
@@ -67,20 +72,17 @@ class Preset:
 PRESETS: dict[str, Preset] = {
     "paper": Preset(levels=(PyramidLevel(50_000),), start="zero"),
     "full": Preset(levels=(PyramidLevel(50_000),), start="mean"),
-    # From a sharp start the paper's weights blur: the L1 term holds on to the start instead, and only what a
-    # discriminator that has been trained before objects to is changed. Two kitchens at 640x480, LPIPS of held-out views
-    # from .231 and .256: at lambda 1 .229 and .262 after 2,400 steps (chair backs bleed onto dark doors), at 5 the
-    # second gives .2556 after 800.
     "standard": Preset(
         levels=(PyramidLevel(4_000),),
         start="selection",
         pretraining=400,
-        lr_texture=3e-4,
         lr_texture_end=0.05,
         lr_discriminator=2e-4,
-        l1_weight=5.0,
+        l1_weight=1.0,
         l1_target="start",
         l1_decays=0,
+        feature_weight=10.0,
+        alignment=True,
         max_crop=(384, 288),
     ),
     "preview": Preset(levels=(PyramidLevel(1_500, scale=2), PyramidLevel(400)), start="mean", l1_decays=8),

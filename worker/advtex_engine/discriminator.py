@@ -33,13 +33,18 @@ class PatchDiscriminator(nn.Module):
 
     def forward(self, condition: Tensor, residual: Tensor) -> Tensor:
         """condition I_A [B,3,H,W] and residual X - I_A [B,3,H,W] -> logits [B,1,H//8-2,W//8-2], one per 70x70 patch."""
+        return self.examine(condition, residual)[0]
+
+    def examine(self, condition: Tensor, residual: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """The logits as from `forward`, and what the four layers before them respond: [B,64|128,h,w] each."""
         assert condition.shape == residual.shape and condition.shape[1] == 3
         assert min(condition.shape[-2:]) >= MIN_SIZE
         x = torch.cat((condition, residual), 1).contiguous(memory_format=torch.channels_last)
+        features = []
         for layer in self.convolutions[:-1]:
             x = F.leaky_relu(layer(x), 0.2)
-        logits: Tensor = self.convolutions[-1](x)
-        return logits
+            features.append(x)
+        return self.convolutions[-1](x), features
 
 
 def patch_shares(mask: Tensor) -> Tensor:

@@ -1,7 +1,8 @@
-"""The losses of both players, over the patches that count (paper sections 3.2 and 3.3)."""
+"""The losses of both players, over the patches that count (paper sections 3.2 and 3.3), and feature matching."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -53,3 +54,13 @@ def adversarial_loss(fake: Tensor, mask: Tensor) -> Tensor:
 def l1_loss(fake: Tensor, real: Tensor, visible: Tensor) -> Tensor:
     """Mean absolute difference to the warped auxiliary image where it is visible; images [B,3,H,W]."""
     return masked_mean((fake - real).abs(), visible)
+
+
+def feature_loss(fake: Sequence[Tensor], real: Sequence[Tensor]) -> Tensor:
+    """Mean absolute difference of the discriminator's responses, summed over its layers (Wang et al. 2018, eq. 3).
+
+    No gradient reaches the real example's. Where it is not visible both examples are the same, and the difference nil.
+    """
+    return torch.stack(
+        [(a - b.detach()).abs().mean(dtype=torch.float32) for a, b in zip(fake, real, strict=True)]
+    ).sum()

@@ -19,24 +19,27 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from advtex_engine.alignment import BLOCK, block_offsets, search_bound, shift
 from advtex_engine.batches import Batch, PairSampler
 from advtex_engine.config import Preset
 from advtex_engine.discriminator import MIN_SIZE, PatchDiscriminator
-from advtex_engine.losses import adversarial_loss, discriminator_loss, l1_loss, patch_masks
+from advtex_engine.losses import adversarial_loss, discriminator_loss, feature_loss, l1_loss, patch_masks
 from advtex_engine.texture import sample_texels
 from advtex_engine.views import Pairs, ViewMaps
 
 CROP_SHARE = 0.1  # the released code shifts its crop by up to 69 of 640 pixels, about a tenth of the width
-LOSS_NAMES = ("discriminator", "adversarial", "l1", "skipped")
+WHOLLY_VISIBLE = 0.99  # a moved pixel that mixes in what is not visible does not count
+LOSS_NAMES = ("discriminator", "adversarial", "l1", "features", "skipped")
 
 
 @dataclass(frozen=True)
 class Losses:
-    """0-dim tensors: both players' losses, the L1 term, and 1 where the discriminator is ahead."""
+    """0-dim tensors: both players' losses, the L1 and feature terms, and 1 where the discriminator is ahead."""
 
     discriminator: Tensor
     adversarial: Tensor
     l1: Tensor
+    features: Tensor
     ahead: Tensor
 
 
@@ -88,6 +91,7 @@ class AdversarialOptimizer:
         self.adam_discriminator = _adam(self.parameters, preset.lr_discriminator, preset.beta1)
         self.bfloat16 = native_bfloat16(device)
         self.crop = crop_size(maps.width, maps.height, preset.max_crop)
+        self.aligns = preset.alignment and min(self.crop) >= BLOCK
         self.sampler = PairSampler(maps, pairs, kind, self.crop, generator)
         self._sums = torch.zeros(len(LOSS_NAMES), device=device)
         self._summed = 0
@@ -122,26 +126,40 @@ class AdversarialOptimizer:
             gradient = self.texture_gradient(losses)
             self.update_discriminator(losses)
             self.update_texture(gradient)
-        self._sums += torch.stack((losses.discriminator, losses.adversarial, losses.l1, losses.ahead)).detach()
+        named = (losses.discriminator, losses.adversarial, losses.l1, losses.features, losses.ahead)
+        self._sums += torch.stack(named).detach()
         self._summed += 1
         self.index += 1
 
     def play(self, batch: Batch) -> Losses:
         """Renders the fake example and lets the discriminator judge both; one fake forward pass serves both players."""
-        masks = patch_masks(batch.foreground, batch.visible)
         fake = self._render(self.values, batch)
-        target = batch.real if self.start is None else self._render(self.start, batch)
+        real, aligned, visible = self._align(batch, fake) if self.aligns else (batch.real, fake, batch.visible)
+        masks = patch_masks(batch.foreground, visible)
         # Without the condition the network sees the example itself beside three empty channels.
         condition = batch.condition if self.preset.condition else torch.zeros_like(batch.condition)
         with self._autocast():
-            fake_logits = self.discriminator(condition, (fake - condition) * batch.visible).float()
-            real_logits = self.discriminator(condition, (batch.real - condition) * batch.visible).float()
+            fake_logits, of_fake = self.discriminator.examine(condition, (aligned - condition) * visible)
+            real_logits, of_real = self.discriminator.examine(condition, (real - condition) * visible)
+            fake_logits, real_logits = fake_logits.float(), real_logits.float()
         of_discriminator = discriminator_loss(real_logits, fake_logits, masks.discriminator)
         adversarial = adversarial_loss(fake_logits, masks.texture)
         ahead = (of_discriminator <= adversarial).to(torch.float32).detach()
         if self.pretraining:
             ahead = torch.zeros_like(ahead)
-        return Losses(of_discriminator, adversarial, l1_loss(fake, target, batch.visible), ahead)
+        if self.start is None:
+            l1 = l1_loss(aligned, real, visible)
+        else:
+            l1 = l1_loss(fake, self._render(self.start, batch), batch.visible)
+        features = feature_loss(of_fake, of_real) if self.preset.feature_weight else torch.zeros_like(l1)
+        return Losses(of_discriminator, adversarial, l1, features, ahead)
+
+    def _align(self, batch: Batch, fake: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The real and the fake example moved onto the source, and where both are still visible."""
+        examples = torch.cat((batch.real, fake.detach()))
+        offsets = block_offsets(batch.condition, examples, batch.visible, search_bound(self.maps.width))
+        visible = shift(batch.visible.expand(2, -1, -1, -1), offsets).amin(0, keepdim=True) > WHOLLY_VISIBLE
+        return shift(batch.real, offsets[:1]), shift(fake, offsets[1:]), batch.visible * visible
 
     def _render(self, values: Tensor, batch: Batch) -> Tensor:
         """The compact texture seen by the source view, [1,3,h,w] in [-1,1]."""
@@ -149,7 +167,7 @@ class AdversarialOptimizer:
 
     def texture_gradient(self, losses: Losses) -> Tensor:
         """Gradient [slots,3] of the texture's loss; keeps the graph, which the discriminator's gradient needs too."""
-        loss = losses.adversarial + self.l1_weight * losses.l1
+        loss = losses.adversarial + self.l1_weight * losses.l1 + self.preset.feature_weight * losses.features
         (gradient,) = torch.autograd.grad(loss, [self.values], retain_graph=True)
         return gradient
 

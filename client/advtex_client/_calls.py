@@ -23,7 +23,18 @@ from advtex_client.errors import (
 )
 from advtex_client.uploads import FileStream, PackedScan
 from advtex_contract.errors import ErrorCode
-from advtex_contract.jobs import TERMINAL, JobPage, JobSpec, JobState, JobView, ResultFile, UploadList, UploadView
+from advtex_contract.jobs import (
+    TERMINAL,
+    BatchPage,
+    BatchView,
+    JobPage,
+    JobSpec,
+    JobState,
+    JobView,
+    ResultFile,
+    UploadList,
+    UploadView,
+)
 
 T = TypeVar("T")
 M = TypeVar("M", bound=BaseModel)
@@ -76,13 +87,33 @@ def delete_job(job_id: str) -> Call[None]:
     return Call("DELETE", _job(job_id), _nothing)
 
 
-def list_jobs(state: JobState | None, label: str | None, limit: int, cursor: str | None) -> Call[JobPage]:
-    given: dict[str, str | int | None] = {"state": state, "label": label, "limit": limit, "cursor": cursor}
+def list_jobs(
+    state: JobState | None, label: str | None, batch: str | None, limit: int, cursor: str | None
+) -> Call[JobPage]:
+    given: dict[str, str | int | None] = {"state": state, "label": label, "batch": batch}
+    given |= {"limit": limit, "cursor": cursor}
     return Call("GET", "/v1/jobs", reader(JobPage), params={k: v for k, v in given.items() if v is not None})
 
 
 def get_upload(upload_id: str) -> Call[UploadView]:
     return Call("GET", _upload(upload_id), reader(UploadView))
+
+
+def get_batch(batch_id: str) -> Call[BatchView]:
+    return Call("GET", _batch(batch_id), reader(BatchView))
+
+
+def list_batches(limit: int, cursor: str | None) -> Call[BatchPage]:
+    params: dict[str, str | int] = {"limit": limit} if cursor is None else {"limit": limit, "cursor": cursor}
+    return Call("GET", "/v1/batches", reader(BatchPage), params=params)
+
+
+def cancel_batch(batch_id: str) -> Call[BatchView]:
+    return Call("POST", f"{_batch(batch_id)}/cancel", reader(BatchView))
+
+
+def retry_batch(batch_id: str) -> Call[BatchView]:
+    return Call("POST", f"{_batch(batch_id)}/retry-failed", reader(BatchView), idempotent=False)
 
 
 def find_uploads(sha256: str) -> Call[UploadList]:
@@ -119,6 +150,10 @@ def events_path(job_id: str) -> str:
 
 def _upload(upload_id: str) -> str:
     return f"/v1/uploads/{quote(upload_id, safe='')}"
+
+
+def _batch(batch_id: str) -> str:
+    return f"/v1/batches/{quote(batch_id, safe='')}"
 
 
 def _job(job_id: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC
 from typing import Any
@@ -16,7 +16,7 @@ from rich.table import Table
 
 from advtex_client.errors import ClientError
 from advtex_contract.errors import ErrorDetail
-from advtex_contract.jobs import JobState, JobView, ResultFile
+from advtex_contract.jobs import TERMINAL, BatchView, JobState, JobView, ResultFile
 
 LOG_LINES = 15  # of a failed job's log
 
@@ -26,6 +26,7 @@ class Display:
 
     def __init__(self, as_json: bool) -> None:
         self.as_json = as_json
+        self._said = ""
         self.notes = Console(stderr=True, highlight=False, soft_wrap=True)
 
     def note(self, text: str) -> None:
@@ -59,6 +60,36 @@ class Display:
         columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[detail]}"))
         with Progress(*columns, console=self.notes, transient=True, disable=not self._bars) as bars:
             yield JobBar(bars, self)
+
+    @contextmanager
+    def count_bar(self, title: str, total: int) -> Iterator[Callable[[], None]]:
+        """A bar that moves by one."""
+        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"))
+        with Progress(*columns, console=self.notes, transient=True, disable=not self._bars) as bars:
+            task = bars.add_task(title, total=total)
+            yield lambda: bars.advance(task)
+
+    @contextmanager
+    def batch_bar(self) -> Iterator[Callable[[BatchView], None]]:
+        """A bar of the jobs that have ended; a line per change where stderr is no terminal."""
+        columns = (TextColumn("{task.description}"), BarColumn())
+        with Progress(*columns, console=self.notes, transient=True, disable=not self._bars) as bars:
+            task = bars.add_task("", total=None)
+
+            def show(batch: BatchView) -> None:
+                if self._bars:
+                    ended = sum(count for state, count in batch.states.items() if state in TERMINAL)
+                    bars.update(task, description=batch_line(batch), total=batch.jobs, completed=ended)
+                else:
+                    self.once(batch_line(batch.model_copy(update={"eta_seconds": None})))
+
+            yield show
+
+    def once(self, text: object) -> None:
+        """A note, unless it was the last one too."""
+        if str(text) != self._said:
+            self._said = str(text)
+            self.note(self._said)
 
     @property
     def _bars(self) -> bool:
@@ -160,6 +191,32 @@ def job_table(jobs: Sequence[JobView]) -> str:
         progress = job.progress
         stage = f"{progress.stage} {progress.step}/{progress.steps}" if progress.steps else progress.stage
         table.add_row(job.id, job.state, stage, f"{job.created_at:%Y-%m-%d %H:%M}", job.label)
+    return _drawn(table)
+
+
+def batch_line(batch: BatchView) -> str:
+    """`night: 30 jobs, 12 succeeded, 18 queued, about 2 h 5 min left`."""
+    parts = [f"{batch.jobs} jobs", *(f"{count} {state}" for state, count in sorted(batch.states.items()))]
+    if batch.eta_seconds and not batch.finished:
+        parts.append(f"about {duration(batch.eta_seconds)} left")
+    return f"{batch.id}: {', '.join(parts)}"
+
+
+def batch_table(rows: Sequence[dict[str, Any]]) -> str:
+    """What the jobs of a batch came to, with a column per score."""
+    scores = list(dict.fromkeys(name for row in rows for name in row.get("scores", {})))
+    table = Table(box=None, pad_edge=False)
+    for title in ("label", "state", "steps", "time", *scores):
+        table.add_column(title, overflow="fold", justify="left" if title in ("label", "state") else "right")
+    for row in rows:
+        found = row.get("scores", {})
+        shown = [f"{found[name]:.4g}" if name in found else "" for name in scores]
+        spent = duration(row["seconds"]) if row["seconds"] else ""
+        table.add_row(row["label"] or row["job"], row["state"], str(row["steps"] or ""), spent, *shown)
+    return _drawn(table)
+
+
+def _drawn(table: Table) -> str:
     console = Console(width=160, highlight=False, markup=False, emoji=False)
     with console.capture() as captured:
         console.print(table)

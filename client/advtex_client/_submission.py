@@ -26,12 +26,20 @@ from advtex_scan.check import check_scan
 Steps = Generator[Step, Any, JobView]
 
 
-def ensure_submittable(scan: Path, label: str) -> None:
-    """The checks that the server makes too, before anything is sent. Raises ScanRejectedError with every finding."""
+def job_spec(
+    options: JobOptions | None = None, label: str = "", batch: str | None = None, priority: int = 0, upload_id: str = ""
+) -> JobSpec:
+    """What to ask for; ClientError for what no server would accept."""
+    options = options or JobOptions()
     try:
-        JobSpec(upload_id="", label=label)
+        return JobSpec(upload_id=upload_id, options=options, label=label, batch=batch, priority=priority)
     except ValidationError as error:
-        raise ClientError(f"label {label!r} cannot be used: {error.errors()[0]['msg']}") from error
+        first = error.errors()[0]
+        raise ClientError(f"{first['loc'][0]} {first['input']!r} cannot be used: {first['msg']}") from error
+
+
+def ensure_submittable(scan: Path) -> None:
+    """The check that the server makes too, before anything is sent. Raises ScanRejectedError with every finding."""
     report = check_scan(scan)
     if report.ok:
         return
@@ -46,14 +54,16 @@ def ensure_submittable(scan: Path, label: str) -> None:
 def submission(
     memory: SubmissionMemory,
     scan: PackedScan,
-    options: JobOptions,
-    label: str,
+    spec: JobSpec,
     *,
     retries: int,
     new: bool = False,
     on_bytes: OnBytes | None = None,
 ) -> Steps:
-    """Go on with a remembered submission, or begin one. With `new`, a job of its own is made in any case."""
+    """Go on with a remembered submission, or begin one. With `new`, a job of its own is made in any case.
+
+    spec: what to do with the scan; its upload is filled in.
+    """
     known = memory.load()
     if known.job_id is not None and not new:
         try:
@@ -66,7 +76,7 @@ def submission(
         memory.save(known)
     known = yield from _uploaded(memory, known, scan, retries, on_bytes)
     assert known.upload_id is not None
-    spec = JobSpec(upload_id=known.upload_id, options=options, label=label)
+    spec = spec.model_copy(update={"upload_id": known.upload_id})
     try:
         job = yield calls.create_job(spec, memory.idempotency_key(known))
     except ConflictError as error:

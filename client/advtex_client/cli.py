@@ -5,46 +5,40 @@ Exit codes: 0 ok, 2 usage, 3 auth, 4 rejected scan, 5 job failed, 6 network, 7 t
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from pydantic import ValidationError
 
+from advtex_client import cli_batch
 from advtex_client._calls import ensure_succeeded
+from advtex_client._cli import (
+    EXIT_CODES,
+    ApiKey,
+    AsJson,
+    Folder,
+    HoldoutOption,
+    JobId,
+    MethodOption,
+    PresetOption,
+    PriorityOption,
+    ScanPath,
+    Seconds,
+    SizeOption,
+    StepsOption,
+    Url,
+    command,
+    job_options,
+    parsed_size,
+)
 from advtex_client._display import Display, finding_lines, job_lines, job_table
 from advtex_client.client import Client
-from advtex_client.errors import (
-    AuthError,
-    BusyError,
-    ClientError,
-    IntegrityError,
-    JobFailedError,
-    NetworkError,
-    ScanRejectedError,
-    ServerError,
-    WaitTimeoutError,
-)
+from advtex_client.errors import ScanRejectedError
 from advtex_contract.jobs import TERMINAL, JobState, JobView
-from advtex_contract.options import METHOD_HELP, PRESET_HELP, JobOptions, Method, Preset
+from advtex_contract.options import Method, Preset
 from advtex_scan.check import check_scan
 
-EXIT_CODES: dict[type[ClientError], int] = {
-    AuthError: 3,
-    ScanRejectedError: 4,
-    JobFailedError: 5,
-    NetworkError: 6,
-    ServerError: 6,
-    BusyError: 6,
-    IntegrityError: 6,
-    WaitTimeoutError: 7,
-}
 RETRYABLE = (JobState.failed, JobState.canceled)
-USAGE = 2
-INTERRUPTED = 130
 
 app = typer.Typer(
     help="Texture RGB-D scans on an advtex server.",
@@ -53,31 +47,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-
-ScanPath = Annotated[Path, typer.Argument(exists=True, readable=True, help="a scan: a folder or a zip")]
-JobId = Annotated[str, typer.Argument(help="the job's id, as `submit` prints it", metavar="JOB")]
-AsJson = Annotated[bool, typer.Option("--json", help="print JSON on stdout")]
-Url = Annotated[str | None, typer.Option("--url", help="the server; else ADVTEX_URL or the configuration file")]
-ApiKey = Annotated[str | None, typer.Option("--api-key", help="the key; better given as ADVTEX_API_KEY")]
-Seconds = Annotated[float | None, typer.Option("--timeout", min=0, help="stop waiting after this many seconds")]
-Folder = Annotated[Path | None, typer.Option("-o", "--output", help="fetch the results into this folder")]
-METHODS = "; ".join(f"{method}: {text}" for method, text in METHOD_HELP.items())
-PRESETS = "; ".join(f"{preset}: {text}" for preset, text in PRESET_HELP.items())
-
-
-@contextmanager
-def command(as_json: bool) -> Iterator[Display]:
-    """Every command's frame: errors become one message and an exit code."""
-    display = Display(as_json)
-    try:
-        yield display
-    except ClientError as error:
-        exit_code = next((code for kind, code in EXIT_CODES.items() if isinstance(error, kind)), USAGE)
-        display.failure(error, exit_code)
-        raise typer.Exit(exit_code) from error
-    except KeyboardInterrupt as error:
-        display.note("interrupted; what was sent or started on the server stays there")
-        raise typer.Exit(INTERRUPTED) from error
+app.add_typer(cli_batch.app, name="batch")
 
 
 @app.command()
@@ -93,15 +63,16 @@ def check(scan: ScanPath, as_json: AsJson = False) -> None:
 @app.command()
 def submit(
     scan: ScanPath,
-    preset: Annotated[Preset, typer.Option(help=PRESETS)] = Preset.auto,
-    method: Annotated[Method, typer.Option(help=METHODS)] = Method.adversarial,
-    size: Annotated[str | None, typer.Option(metavar="WxH", help="working size of the views, pixels")] = None,
-    holdout: Annotated[int | None, typer.Option(help="leave out every Nth frame and score on it")] = None,
-    steps: Annotated[int | None, typer.Option(help="overrides the preset's step count")] = None,
+    preset: PresetOption = Preset.auto,
+    method: MethodOption = Method.adversarial,
+    size: SizeOption = None,
+    holdout: HoldoutOption = None,
+    steps: StepsOption = None,
     seed: Annotated[int | None, typer.Option(help="of the random numbers")] = None,
     face_budget: Annotated[int | None, typer.Option(help="decimate the mesh to this many faces")] = None,
     max_texture_size: Annotated[int | None, typer.Option(help="cap on the texture's side, texels")] = None,
     label: Annotated[str, typer.Option(help="a name of your own for the job")] = "",
+    priority: PriorityOption = 0,
     new: Annotated[bool, typer.Option("--new", help="make another job even if this scan was submitted before")] = False,
     wait: Annotated[bool, typer.Option("--wait", help="follow the job until it ends")] = False,
     output: Folder = None,
@@ -112,8 +83,8 @@ def submit(
 ) -> None:
     """Check a scan, send it and queue a job. Run again, it goes on with the same job. -o waits and fetches."""
     with command(as_json) as display:
-        width, height = _parsed_size(size)
-        options = _options(
+        width, height = parsed_size(size)
+        options = job_options(
             preset=preset,
             method=method,
             width=width,
@@ -126,7 +97,7 @@ def submit(
         )
         with Client(url, api_key) as client:
             with display.bytes_bar("sending") as bar:
-                job = client.submit(scan, options, label=label, new=new, on_bytes=bar.upload)
+                job = client.submit(scan, options, label=label, priority=priority, new=new, on_bytes=bar.upload)
             for line in finding_lines(job.warnings):
                 display.note(line)
             if job.state in TERMINAL:
@@ -165,6 +136,7 @@ def watch(
 def list_(
     state: Annotated[JobState | None, typer.Option(help="only jobs in this state")] = None,
     label: Annotated[str | None, typer.Option(help="only jobs with this label")] = None,
+    batch: Annotated[str | None, typer.Option(help="only jobs of this batch")] = None,
     limit: Annotated[int, typer.Option(min=1, help="show at most this many")] = 50,
     url: Url = None,
     api_key: ApiKey = None,
@@ -172,7 +144,7 @@ def list_(
 ) -> None:
     """List jobs, newest first."""
     with command(as_json) as display, Client(url, api_key) as client:
-        found = client.list_jobs(state=state, label=label, page=min(limit, 100))
+        found = client.list_jobs(state=state, label=label, batch=batch, page=min(limit, 100))
         jobs = [job for job, _ in zip(found, range(limit), strict=False)]
         display.data(jobs, job_table(jobs) if jobs else "no jobs")
 
@@ -253,24 +225,6 @@ def _download(client: Client, display: Display, job: JobView, output: Path, name
 
 def _lines(paths: list[Path]) -> str:
     return "\n".join(str(path) for path in paths)
-
-
-def _parsed_size(size: str | None) -> tuple[int | None, int | None]:
-    if size is None:
-        return None, None
-    match = re.fullmatch(r"(\d{1,6})[x×](\d{1,6})", size.strip().lower())
-    if match is None:
-        raise ClientError(f"--size {size!r} is no size; give it as WxH in pixels, for example 320x240")
-    return int(match[1]), int(match[2])
-
-
-def _options(**given: object) -> JobOptions:
-    try:
-        return JobOptions.model_validate({name: value for name, value in given.items() if value is not None})
-    except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(str(part) for part in first["loc"])
-        raise ClientError(f"option {field}={first['input']!r} is out of bounds: {first['msg']}") from error
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Generator, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -14,13 +15,13 @@ from advtex_client import _calls as calls
 from advtex_client._events import OnTrouble, Watch, is_event_stream
 from advtex_client._http import LIMITS, TIMEOUT, base_headers, build, result_url
 from advtex_client._sending import Step, sending
-from advtex_client._submission import ensure_submittable, submission
+from advtex_client._submission import ensure_submittable, job_spec, submission
 from advtex_client.config import load_config
 from advtex_client.downloads import Download, OnFileBytes, is_there, target_path
-from advtex_client.errors import ClientError
+from advtex_client.errors import ClientError, NotFoundError
 from advtex_client.memory import SubmissionMemory, upload_alone
-from advtex_client.uploads import OnBytes, packed
-from advtex_contract.jobs import JobSpec, JobState, JobView, ResultFile, UploadView
+from advtex_client.uploads import OnBytes, PackedScan, packed
+from advtex_contract.jobs import BatchView, JobSpec, JobState, JobView, ResultFile, UploadView
 from advtex_contract.options import JobOptions
 
 T = TypeVar("T")
@@ -81,6 +82,7 @@ class Client:
         options: JobOptions | None = None,
         *,
         label: str = "",
+        priority: int = 0,
         new: bool = False,
         on_bytes: OnBytes | None = None,
     ) -> JobView:
@@ -88,13 +90,27 @@ class Client:
 
         Raises ScanRejectedError, with every problem found, before anything is sent. `new` makes another job.
         """
-        ensure_submittable(scan, label)
-        options = options or JobOptions()
+        spec = job_spec(options, label, priority=priority)
+        ensure_submittable(scan)
         with packed(scan) as archive:
-            memory = SubmissionMemory(self.config.url, archive.sha256, options, label)
-            steps = submission(memory, archive, options, label, retries=self._retries, new=new, on_bytes=on_bytes)
-            with memory.alone(), upload_alone(self.config.url, archive.sha256):
-                return self._drive(steps)
+            memory = SubmissionMemory(self.config.url, archive.sha256, spec.options.model_dump_json(), label)
+            return self._submit(memory, archive, spec, new, on_bytes)
+
+    def submit_remembered(self, memory: SubmissionMemory, scan: Path, spec: JobSpec) -> JobView:
+        """Like `submit`, but what is the same submission is said by `memory`, so that a job that was made before is
+        found without packing the scan again."""
+        if (job_id := memory.load().job_id) is not None:
+            with suppress(NotFoundError):
+                return self.get_job(job_id)
+        ensure_submittable(scan)
+        with packed(scan) as archive:
+            return self._submit(memory, archive, spec, False, None)
+
+    def _submit(
+        self, memory: SubmissionMemory, archive: PackedScan, spec: JobSpec, new: bool, on_bytes: OnBytes | None
+    ) -> JobView:
+        with memory.alone(), upload_alone(self.config.url, archive.sha256):
+            return self._drive(submission(memory, archive, spec, retries=self._retries, new=new, on_bytes=on_bytes))
 
     def _drive(self, steps: Generator[Step, Any, T]) -> T:
         try:
@@ -118,15 +134,36 @@ class Client:
         return self._run(calls.get_job(job_id))
 
     def list_jobs(
-        self, *, state: JobState | None = None, label: str | None = None, page: int = 100
+        self, *, state: JobState | None = None, label: str | None = None, batch: str | None = None, page: int = 100
     ) -> Iterator[JobView]:
         """All jobs, newest first, fetched page by page."""
         cursor = None
         while True:
-            answer = self._run(calls.list_jobs(state, label, page, cursor))
+            answer = self._run(calls.list_jobs(state, label, batch, page, cursor))
             yield from answer.jobs
             if (cursor := answer.next_cursor) is None:
                 return
+
+    def get_batch(self, batch_id: str) -> BatchView:
+        """How the jobs of a batch stand, and how long the rest takes."""
+        return self._run(calls.get_batch(batch_id))
+
+    def list_batches(self, *, page: int = 100) -> Iterator[BatchView]:
+        """All batches, newest first, fetched page by page."""
+        cursor = None
+        while True:
+            answer = self._run(calls.list_batches(page, cursor))
+            yield from answer.batches
+            if (cursor := answer.next_cursor) is None:
+                return
+
+    def cancel_batch(self, batch_id: str) -> BatchView:
+        """Cancel every job of a batch that has not ended."""
+        return self._run(calls.cancel_batch(batch_id))
+
+    def retry_batch(self, batch_id: str) -> BatchView:
+        """Queue every failed job of a batch again; each goes on from its newest checkpoint."""
+        return self._run(calls.retry_batch(batch_id))
 
     def cancel_job(self, job_id: str) -> JobView:
         """Stop a job; a running one writes a checkpoint first."""

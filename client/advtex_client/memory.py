@@ -16,8 +16,6 @@ from pathlib import Path
 import platformdirs
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from advtex_contract.options import JobOptions
-
 if sys.platform != "win32":
     import fcntl
 
@@ -39,12 +37,10 @@ class Submission(BaseModel):
 
 
 class SubmissionMemory:
-    """The record of one submission: this scan with these options and this label on this server."""
+    """The record of one submission on one server. `identity`: what makes it the same one, without line breaks."""
 
-    def __init__(self, server: str, sha256: str, options: JobOptions, label: str, folder: Path | None = None) -> None:
-        self._identity = hashlib.sha256(
-            "\n".join((sha256, options.model_dump_json(), label)).encode()  # a label holds no line break
-        ).hexdigest()
+    def __init__(self, server: str, *identity: str, folder: Path | None = None) -> None:
+        self._identity = hashlib.sha256("\n".join(identity).encode()).hexdigest()
         place = hashlib.sha256(f"{server}\n{self._identity}".encode()).hexdigest()[:32]
         self.path = _folder(folder) / "submissions" / f"{place}.json"
 
@@ -60,17 +56,22 @@ class SubmissionMemory:
             return Submission()
 
     def save(self, submission: Submission) -> None:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=self.path.parent, suffix=".tmp")
-        with os.fdopen(handle, "wb") as file:
-            file.write(submission.model_dump_json().encode())
-            file.flush()
-            os.fsync(file.fileno())
-        Path(name).replace(self.path)
+        write_whole(self.path, submission.model_dump_json())
 
     def idempotency_key(self, submission: Submission) -> str:
         """The same for every try of the same submission."""
         return f"{self._identity[:48]}{submission.salt}"
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Replace a file durably: a crash leaves the old one or the new one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
+    with os.fdopen(handle, "wb") as file:
+        file.write(text.encode())
+        file.flush()
+        os.fsync(file.fileno())
+    Path(name).replace(path)
 
 
 def _folder(folder: Path | None) -> Path:

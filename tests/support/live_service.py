@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -54,7 +54,7 @@ def process_tree(pid: int) -> list[int]:
 class LiveService:
     """Started by `live_service`. `store` looks at the same rows and blobs as the server and its workers."""
 
-    def __init__(self, folder: Path, blobs: Path | None = None) -> None:
+    def __init__(self, folder: Path, blobs: Path | None = None, settings: Mapping[str, str] | None = None) -> None:
         self.folder = folder
         folder.mkdir(exist_ok=True)
         self.redis_port = free_port()
@@ -66,16 +66,17 @@ class LiveService:
             "ADVTEX_DATA_DIR": str(folder / "data"),
             "ADVTEX_REDIS_URL": f"redis://127.0.0.1:{self.redis_port}/0",
             "PYTHONPATH": os.pathsep.join(path),
+            **(settings or {}),
         }
         blob_url = "" if blobs is None else blobs.as_uri()
         if blob_url:
             self.environment["ADVTEX_BLOB_URL"] = blob_url
         self.redis = self.start_redis()
         self.url = self._start_server()
-        settings = StoreSettings(
+        places = StoreSettings(
             data_dir=folder / "data", blob_url=blob_url, redis_url=self.environment["ADVTEX_REDIS_URL"]
         )
-        self.store: Store = open_store(settings)
+        self.store: Store = open_store(places)
         self.key = Accounts(self.store.database).create_key("tests", owner="tests")
 
     def start_redis(self) -> subprocess.Popen[bytes]:
@@ -122,8 +123,10 @@ class LiveService:
 
 
 @contextmanager
-def live_service(folder: Path, blobs: Path | None = None) -> Iterator[LiveService]:
-    service = LiveService(folder, blobs)
+def live_service(
+    folder: Path, blobs: Path | None = None, settings: Mapping[str, str] | None = None
+) -> Iterator[LiveService]:
+    service = LiveService(folder, blobs, settings)
     try:
         yield service
     except BaseException:

@@ -1,0 +1,91 @@
+"""What all commands share: options, exit codes, and how errors end them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from pydantic import ValidationError
+
+from advtex_client._display import Display
+from advtex_client.errors import (
+    AuthError,
+    BusyError,
+    ClientError,
+    IntegrityError,
+    JobFailedError,
+    NetworkError,
+    ScanRejectedError,
+    ServerError,
+    WaitTimeoutError,
+)
+from advtex_contract.options import METHOD_HELP, PRESET_HELP, JobOptions, Method, Preset
+
+EXIT_CODES: dict[type[ClientError], int] = {
+    AuthError: 3,
+    ScanRejectedError: 4,
+    JobFailedError: 5,
+    NetworkError: 6,
+    ServerError: 6,
+    BusyError: 6,
+    IntegrityError: 6,
+    WaitTimeoutError: 7,
+}
+USAGE = 2
+INTERRUPTED = 130
+
+ScanPath = Annotated[Path, typer.Argument(exists=True, readable=True, help="a scan: a folder or a zip")]
+JobId = Annotated[str, typer.Argument(help="the job's id, as `submit` prints it", metavar="JOB")]
+AsJson = Annotated[bool, typer.Option("--json", help="print JSON on stdout")]
+Url = Annotated[str | None, typer.Option("--url", help="the server; else ADVTEX_URL or the configuration file")]
+ApiKey = Annotated[str | None, typer.Option("--api-key", help="the key; better given as ADVTEX_API_KEY")]
+Seconds = Annotated[float | None, typer.Option("--timeout", min=0, help="stop waiting after this many seconds")]
+Folder = Annotated[Path | None, typer.Option("-o", "--output", help="fetch the results into this folder")]
+_METHODS = "; ".join(f"{method}: {text}" for method, text in METHOD_HELP.items())
+_PRESETS = "; ".join(f"{preset}: {text}" for preset, text in PRESET_HELP.items())
+
+PresetOption = Annotated[Preset, typer.Option("--preset", help=_PRESETS)]
+MethodOption = Annotated[Method, typer.Option("--method", help=_METHODS)]
+SizeOption = Annotated[str | None, typer.Option("--size", metavar="WxH", help="working size of the views, pixels")]
+HoldoutOption = Annotated[int | None, typer.Option("--holdout", help="leave out every Nth frame and score on it")]
+StepsOption = Annotated[int | None, typer.Option("--steps", help="overrides the preset's step count")]
+PriorityOption = Annotated[int, typer.Option("--priority", min=-100, max=100, help="larger runs earlier")]
+
+
+@contextmanager
+def command(as_json: bool) -> Iterator[Display]:
+    """Every command's frame: errors become one message and an exit code."""
+    display = Display(as_json)
+    try:
+        yield display
+    except ClientError as error:
+        exit_code = next((code for kind, code in EXIT_CODES.items() if isinstance(error, kind)), USAGE)
+        display.failure(error, exit_code)
+        raise typer.Exit(exit_code) from error
+    except KeyboardInterrupt as error:
+        display.note("interrupted; what was sent or started on the server stays there")
+        raise typer.Exit(INTERRUPTED) from error
+
+
+def parsed_size(size: str | None) -> tuple[int | None, int | None]:
+    """Width and height of `--size`; ClientError."""
+    if size is None:
+        return None, None
+    match = re.fullmatch(r"(\d{1,6})[x×](\d{1,6})", size.strip().lower())
+    if match is None:
+        raise ClientError(f"--size {size!r} is no size; give it as WxH in pixels, for example 320x240")
+    return int(match[1]), int(match[2])
+
+
+def job_options(**given: object) -> JobOptions:
+    """Those that were given; ClientError for one that is out of bounds."""
+    try:
+        return JobOptions.model_validate({name: value for name, value in given.items() if value is not None})
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(str(part) for part in first["loc"])
+        raise ClientError(f"option {field}={first['input']!r} is out of bounds: {first['msg']}") from error

@@ -1,0 +1,134 @@
+"""Submitting a batch: every item becomes one job, however often the submission is broken off and run again."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from advtex_client._submission import job_spec
+from advtex_client.client import Client
+from advtex_client.errors import ApiError, AuthError, BusyError, ClientError, NetworkError
+from advtex_client.manifests import BatchItem
+from advtex_client.memory import SubmissionMemory, write_whole
+from advtex_contract.errors import ErrorCode
+from advtex_contract.jobs import JobView
+from advtex_contract.options import JobOptions
+
+REPORT = "report.json"
+AT_ONCE = 4  # requests for scans by reference; scans that are sent go one after the other
+FULL_SECONDS = 15.0  # between looks whether a quota has room again
+
+OnFull = Callable[[ClientError], None]
+"""Called when the key's quota is used up and the submission waits for room."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of an item: a job, or the reason why there is none."""
+
+    item: BatchItem
+    job: JobView | None = None
+    error: ClientError | None = None
+
+
+class BatchRun(BaseModel):
+    """What `batch resume` needs to know about a `batch submit`."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    place: Path
+    by_reference: bool
+    options: JobOptions
+    priority: int
+
+
+def remember(server: str, batch_id: str, run: BatchRun, folder: Path | None = None) -> None:
+    """Keep how a batch was submitted."""
+    write_whole(_path(server, batch_id, folder), run.model_dump_json())
+
+
+def remembered(server: str, batch_id: str, folder: Path | None = None) -> BatchRun:
+    """How a batch was submitted on this computer; ClientError if it was not."""
+    try:
+        return BatchRun.model_validate_json(_path(server, batch_id, folder).read_bytes())
+    except (FileNotFoundError, ValidationError) as error:
+        raise ClientError(
+            f"this computer does not remember how batch {batch_id} was submitted; run `batch submit` again with "
+            f"--id {batch_id}: what is there already is not made twice"
+        ) from error
+
+
+def submit_batch(
+    client: Client, batch_id: str, items: Sequence[BatchItem], on_full: OnFull = lambda _: None
+) -> Iterator[Outcome]:
+    """One outcome per item, as they come. A scan that is refused does not stop the others; a lost line or a wrong key
+    raises, and running it again goes on."""
+    for item in items:
+        job_spec(item.options, item.label, batch_id, item.priority)  # nothing is sent if one cannot be
+    sent = [item for item in items if item.path is not None]
+    referred = [item for item in items if item.path is None]
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        yield from pool.map(lambda item: _submitted(client, batch_id, item, on_full), referred)
+    for item in sent:
+        yield _submitted(client, batch_id, item, on_full)
+
+
+def result_rows(client: Client, batch_id: str) -> Iterator[dict[str, Any]]:
+    """A batch's jobs, oldest first, for a table: what each came to, and its scores where frames were held out."""
+    for job in reversed(list(client.list_jobs(batch=batch_id))):
+        row: dict[str, Any] = {"job": job.id, "label": job.label, "state": job.state.value, "steps": job.progress.steps}
+        row["seconds"] = round(sum(job.progress.stage_seconds.values()), 1)
+        if job.error is not None:
+            row["error"] = job.error.message
+        if any(file.name == REPORT for file in job.results):
+            row["scores"] = _scores(client, job)
+        yield row
+
+
+def _scores(client: Client, job: JobView) -> dict[str, float]:
+    """Means over the held-out views, from the job's report; empty if none was held out."""
+    with TemporaryDirectory(prefix="advtex-") as folder:
+        (path,) = client.download_results(job, Path(folder), names=[REPORT])
+        try:
+            found = (json.loads(path.read_bytes()).get("heldout") or {}).get("texture") or {}
+            return {name: value for name, value in found.items() if name != "views" and isinstance(value, float)}
+        except (ValueError, AttributeError):
+            return {}
+
+
+def _submitted(client: Client, batch_id: str, item: BatchItem, on_full: OnFull) -> Outcome:
+    while True:
+        try:
+            return Outcome(item, job=_submit(client, batch_id, item))
+        except BusyError as error:
+            if error.error.code is not ErrorCode.quota_exceeded:
+                raise
+            on_full(error)
+            time.sleep(FULL_SECONDS)
+        except (AuthError, NetworkError):
+            raise
+        except ClientError as error:
+            if isinstance(error, ApiError) and error.status >= 500:
+                raise
+            return Outcome(item, error=error)
+
+
+def _submit(client: Client, batch_id: str, item: BatchItem) -> JobView:
+    memory = SubmissionMemory(client.config.url, "batch", batch_id, *item.identity)
+    spec = job_spec(item.options, item.label, batch_id, item.priority)
+    if item.path is not None:
+        return client.submit_remembered(memory, item.path, spec)
+    spec = spec.model_copy(update={"upload_id": None, "source": item.source})
+    return client.create_job(spec, idempotency_key=memory.idempotency_key(memory.load()))
+
+
+def _path(server: str, batch_id: str, folder: Path | None) -> Path:
+    return SubmissionMemory(server, "batch", batch_id, folder=folder).path.with_suffix(".batch")

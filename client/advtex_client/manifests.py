@@ -1,0 +1,119 @@
+"""What a batch consists of: a folder of scans, or a manifest (CSV or JSON lines) that lists them.
+
+path       a scan's folder or zip, relative to the manifest, or its file:// or s3:// URL on the server's side
+label      the job's name; the last part of the path if it is left out
+options    a JSON object of options that differ from those of the command
+priority   larger runs earlier
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from advtex_client.errors import ClientError
+from advtex_contract.options import JobOptions
+
+COLUMNS = ("path", "label", "options", "priority")
+SCHEMES = ("file://", "s3://")
+
+
+@dataclass(frozen=True)
+class BatchItem:
+    """One job to be: `path` is a scan on this computer, `source` the URL of one that the server can read."""
+
+    path: Path | None
+    source: str | None
+    label: str
+    options: JobOptions
+    priority: int = 0
+
+    @property
+    def identity(self) -> tuple[str, ...]:
+        """What makes it the same item in a later run."""
+        return self.source or str(self.path), self.label, self.options.model_dump_json(), str(self.priority)
+
+
+def read_items(place: Path, options: JobOptions, priority: int = 0, by_reference: bool = False) -> list[BatchItem]:
+    """The scans of a folder (each folder and zip in it), or those that a manifest lists; ClientError, with the line.
+
+    by_reference: the server reads them at the same path; nothing is sent.
+    """
+    found: list[tuple[str, Mapping[str, Any]]]
+    try:
+        if place.is_dir():
+            found = [(f"{place.name}/{name}", {"path": name}) for name in _scans(place)]
+            base = place
+        else:
+            found = [(f"{place.name} line {number}", row) for number, row in _rows(place)]
+            base = place.parent
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        remedy = "give a folder of scans, a .csv or a .jsonl file"
+        raise ClientError(f"{place} cannot be read: {error}; {remedy}") from error
+    items = [_item(where, row, base, options, priority, by_reference) for where, row in found]
+    if not items:
+        raise ClientError(f"{place} holds no scans; give the folder that holds their folders or zips, or a manifest")
+    seen: dict[tuple[str, ...], str] = {}
+    for (where, _), item in zip(found, items, strict=True):
+        if item.identity in seen:
+            raise ClientError(f"{where} is the same as {seen[item.identity]}; remove one, or give them labels")
+        seen[item.identity] = where
+    return items
+
+
+def _scans(folder: Path) -> list[str]:
+    paths = (path for path in folder.iterdir() if not path.name.startswith("."))
+    return sorted(path.name for path in paths if path.is_dir() or path.suffix.lower() == ".zip")
+
+
+def _rows(manifest: Path) -> Iterator[tuple[int, Mapping[str, Any]]]:
+    with manifest.open(encoding="utf-8-sig", newline="") as file:
+        if manifest.suffix.lower() == ".csv":
+            reader = csv.DictReader(file, strict=True)
+            for row in reader:
+                yield reader.line_num, {name: value for name, value in row.items() if value not in (None, "")}
+            return
+        for number, line in enumerate(file, 1):
+            if not line.strip():
+                continue
+            try:
+                parsed = json.loads(line)
+            except ValueError as error:
+                raise ClientError(f"{manifest.name} line {number} is no JSON: {error}") from error
+            if not isinstance(parsed, dict):
+                raise ClientError(f"{manifest.name} line {number} is no JSON object")
+            yield number, parsed
+
+
+def _item(
+    where: str, row: Mapping[str, Any], base: Path, options: JobOptions, priority: int, by_reference: bool
+) -> BatchItem:
+    if unknown := [str(name) for name in row if name not in COLUMNS]:
+        raise ClientError(f"{where}: there is no column {unknown[0]!r}; the columns are {', '.join(COLUMNS)}")
+    name, label = row.get("path"), row.get("label")
+    if not isinstance(name, str) or not name:
+        raise ClientError(f"{where}: the path is missing")
+    if label is None:
+        label = name.rstrip("/").rpartition("/")[2]
+    try:
+        given = row.get("options", {})
+        given = json.loads(given) if isinstance(given, str) else given
+        merged = JobOptions.model_validate(options.model_dump() | given)
+        wanted = int(row.get("priority", priority))
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ClientError(f"{where}: options.{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+    except (ValueError, TypeError) as error:
+        raise ClientError(f"{where}: options must be a JSON object and priority a number: {error}") from error
+    if name.startswith(SCHEMES):
+        return BatchItem(None, name, str(label), merged, wanted)
+    path = (base / name).absolute()
+    if by_reference:
+        return BatchItem(None, path.as_uri(), str(label), merged, wanted)
+    return BatchItem(path, None, str(label), merged, wanted)

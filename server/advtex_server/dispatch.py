@@ -44,6 +44,7 @@ class Dispatcher:
         self._woken = asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._ill = False
+        self._next_sweep = 0.0
 
     def wake(self) -> None:
         """From any thread: look now."""
@@ -135,4 +136,10 @@ class Dispatcher:
                 log.info("adopted a finished result", job=row.id)
         self.retention.expire()
         self.retention.purge()
+        self.retention.tidy()
+        self.store.webhooks.drop_old()
+        if time.monotonic() >= self._next_sweep:
+            self._next_sweep = time.monotonic() + self.settings.sweep_seconds
+            if orphans := self.retention.sweep():
+                log.info("orphans removed", count=orphans)
         self.store.blobs.clear_spool(time.time() - SPOOL_SECONDS)

@@ -16,6 +16,7 @@ class ServerSettings(StoreSettings):
     max_body_bytes: int = Field(default=1 << 20, gt=0, description="of requests that are not uploads")
     dispatch_seconds: float = Field(default=1.0, gt=0, description="between looks at waiting jobs")
     reconcile_seconds: float = Field(default=10.0, gt=0, description="between looks at leases and old blobs")
+    sweep_seconds: float = Field(default=3600.0, gt=0, description="between looks for blobs that no row refers to")
     queue_depth: int = Field(default=1, gt=0, description="attempts that wait in Redis, per worker")
     webhook_allow_http: bool = Field(default=False, description="webhooks may go to http:// addresses")
     webhook_networks: tuple[IPvAnyNetwork, ...] = Field(

@@ -26,7 +26,7 @@ from advtex_store.files import fsync_dir, translated
 from advtex_store.partials import FolderPartial, Partial, PublishedPartial
 
 CHUNK = 1 << 20
-PLACE_ATTEMPTS = 5
+PLACE_ATTEMPTS = 100
 PARTIAL_SUFFIX = ".partial"
 _KEY = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*(/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
 
@@ -117,6 +117,10 @@ class Blobs(ABC):
     @abstractmethod
     def list(self, prefix: str) -> Iterator[BlobInfo]:
         """All blobs below a prefix that ends in `/`, sorted by key."""
+
+    @abstractmethod
+    def folders(self, prefix: str) -> Iterator[str]:
+        """The next path segments below a prefix that ends in `/`, of whatever lies deeper."""
 
     @abstractmethod
     def delete(self, key: str) -> None:
@@ -275,6 +279,10 @@ class FolderBlobs(Blobs):
         for key in paths:
             with suppress(BlobNotFound):
                 yield self.head(key)
+
+    def folders(self, prefix: str) -> Iterator[str]:
+        with suppress(FileNotFoundError), os.scandir(self.path(check_prefix(prefix))) as entries:
+            yield from [entry.name for entry in entries if entry.is_dir(follow_symlinks=False)]
 
     def delete(self, key: str) -> None:
         path = self.path(key)

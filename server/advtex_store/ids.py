@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import secrets
+
+ID = re.compile(r"[0-9a-f]{28}")
 
 
 def new_id(now: float) -> str:

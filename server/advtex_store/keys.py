@@ -11,6 +11,9 @@ earlier ones of the same name. An attempt writes below its own number only, so o
 
 from __future__ import annotations
 
+SCANS = "scans/"
+JOBS = "jobs/"
+
 
 def scan_key(upload_id: str) -> str:
     return f"scans/{upload_id}/scan.zip"
@@ -31,6 +34,11 @@ def checkpoints_prefix(job_id: str) -> str:
 
 def checkpoint_prefix(job_id: str, attempt: int) -> str:
     return f"jobs/{job_id}/checkpoints/{attempt}/"
+
+
+def results_prefix(job_id: str) -> str:
+    """Of all attempts."""
+    return f"jobs/{job_id}/results/"
 
 
 def result_key(job_id: str, attempt: int, name: str) -> str:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from sqlalchemy import ColumnElement, and_, exists, select, update
 
-from advtex_contract.jobs import TERMINAL
+from advtex_contract.jobs import TERMINAL, JobState
 from advtex_store import keys
 from advtex_store.blobs import Blobs
 from advtex_store.database import Database
+from advtex_store.ids import ID
 from advtex_store.models import JobRow, UploadRow
 
 BATCH = 100
+SETTLED_SECONDS = 600.0  # after a job's end; attempts that lost it have noticed by then
 
 
 class Retention:
@@ -58,6 +60,46 @@ class Retention:
             self.blobs.delete_prefix(keys.scan_prefix(upload_id))
             self._done(UploadRow, upload_id)
         return len(jobs) + len(uploads)
+
+    def tidy(self) -> int:
+        """Remove what attempts of succeeded jobs left that is no part of the result. -> how many jobs were done.
+
+        A result never changes, so nothing that a later attempt may write here is wanted either.
+        """
+        with self.database.read() as session:
+            limit = self.database.now(session) - SETTLED_SECONDS
+            query = select(JobRow).where(JobRow.state == JobState.succeeded, JobRow.tidied_at.is_(None))
+            query = query.where(JobRow.finished_at < limit, JobRow.deleted_at.is_(None))
+            rows = session.scalars(query.limit(BATCH)).all()
+        for row in rows:
+            kept = {entry["key"] for entry in row.results}
+            for prefix in (keys.checkpoints_prefix(row.id), keys.results_prefix(row.id)):
+                for info in list(self.blobs.list(prefix)):
+                    if info.key not in kept:
+                        self.blobs.delete(info.key)
+            with self.database.write() as session:
+                session.execute(update(JobRow).where(JobRow.id == row.id).values(tidied_at=self.database.now(session)))
+        return len(rows)
+
+    def sweep(self) -> int:
+        """Remove the blobs of uploads and jobs that have no row, or one that is purged. -> how many there were.
+
+        Never removes what a row refers to: a row is committed before the first blob below its id is written, and ids do
+        not come back. So an id that was seen among the blobs and then, later, has no row has lost it for good. Folders
+        that are named otherwise are somebody else's.
+        """
+        swept = 0
+        tables: tuple[tuple[str, type[JobRow] | type[UploadRow]], ...] = ((keys.SCANS, UploadRow), (keys.JOBS, JobRow))
+        for prefix, table in tables:
+            found = [name for name in self.blobs.folders(prefix) if ID.fullmatch(name)]
+            for start in range(0, len(found), BATCH):
+                ids = found[start : start + BATCH]
+                with self.database.read() as session:
+                    alive = set(session.scalars(select(table.id).where(table.id.in_(ids), table.purged_at.is_(None))))
+                for orphan in set(ids) - alive:
+                    self.blobs.delete_prefix(f"{prefix}{orphan}/")
+                    swept += 1
+        return swept
 
     def _done(self, table: type[JobRow] | type[UploadRow], row_id: str) -> None:
         with self.database.write() as session:

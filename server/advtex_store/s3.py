@@ -57,6 +57,11 @@ class S3Blobs(Blobs):
             found = [_info(meta) for page in pages for meta in page]
         yield from sorted(found, key=lambda info: info.key)
 
+    def folders(self, prefix: str) -> Iterator[str]:
+        with _translated(prefix):
+            found = obstore.list_with_delimiter(self._store, prefix=check_prefix(prefix))
+        yield from [path.rstrip("/").rpartition("/")[2] for path in found["common_prefixes"]]
+
     def delete(self, key: str) -> None:
         with suppress(BlobNotFound), _translated(key):
             obstore.delete(self._store, check_key(key))

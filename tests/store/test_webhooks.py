@@ -26,6 +26,7 @@ def outbox(bench: Any) -> list[dict[str, Any]]:
 
 
 def end(bench: Any, job: str) -> None:
+    bench.clock.now += 0.002  # ids of one millisecond have no order
     bench.records.claim(job, 1, "w")
     bench.records.fail(job, 1, JobError(code="engine_error", message="it broke", log_tail="secret"))
     bench.clock.now += 0.002

@@ -1,0 +1,215 @@
+"""Orphans are removed, and never anything that a row refers to, whatever happens while they are looked for."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from advtex_contract.jobs import JobSpec
+from advtex_store import keys
+from advtex_store.blobs import Blobs, FolderBlobs
+from advtex_store.errors import StoreError
+from advtex_store.ids import new_id
+from advtex_store.models import JobRow, UploadRow
+from advtex_store.results import Results
+from advtex_store.retention import SETTLED_SECONDS, Retention
+
+
+class World:
+    """Everything that servers and workers do with rows and blobs, in their order, on a random object."""
+
+    def __init__(self, bench: Any, blobs: Blobs, folder: Path, data: st.DataObject) -> None:
+        self.bench, self.blobs, self.data = bench, blobs, data
+        self.retention = Retention(bench.database, blobs)
+        self.results = Results(bench.records, blobs)
+        self.file = folder / "file"
+        self.file.write_bytes(b"result")
+        self.uploads: list[str] = []
+        self.jobs: list[str] = []
+        self.owed: dict[str, str] = {}  # blobs that a row refers to -> id of the row
+
+    def actions(self) -> dict[str, Callable[[], object]]:
+        return {
+            "begin upload": self.begin_upload,
+            "finish upload": self.finish_upload,
+            "discard upload": self.discard_upload,
+            "late upload": self.write_late,
+            "create job": self.create_job,
+            "checkpoint": self.checkpoint,
+            "succeed": self.succeed,
+            "cancel": lambda: self.bench.records.cancel(self.pick(self.jobs)),
+            "delete job": self.delete_job,
+            "delete upload": lambda: self.bench.uploads.delete(self.pick(self.uploads)),
+            "time passes": self.pass_time,
+            "expire": self.retention.expire,
+            "purge": self.retention.purge,
+            "tidy": self.retention.tidy,
+        }
+
+    def step(self) -> None:
+        """One action, which may be refused."""
+        actions = self.actions()
+        try:
+            actions[self.data.draw(st.sampled_from(sorted(actions)))]()
+        except (StoreError, IndexError):
+            return
+
+    def pick(self, ids: list[str]) -> str:
+        return ids[self.data.draw(st.integers(0, len(ids) - 1))] if ids else ids[0]
+
+    def begin_upload(self) -> None:
+        self.uploads.append(self.bench.uploads.create("me", 4).id)
+
+    def finish_upload(self) -> None:
+        upload = self.pick(self.uploads)
+        self.bench.uploads.upload(upload)
+        self.blobs.put(keys.scan_key(upload), b"scan")
+        self.bench.uploads.finish(upload, "ab" * 32)
+
+    def discard_upload(self) -> None:
+        """A server that dies between row and blob leaves an orphan."""
+        upload = self.pick(self.uploads)
+        if self.bench.uploads.upload(upload).sha256 is None:
+            self.bench.uploads.discard(upload)
+
+    def write_late(self) -> None:
+        """A writer that does not know yet that its row is gone."""
+        self.blobs.put(keys.scan_key(self.pick(self.uploads)), b"scan")
+
+    def create_job(self) -> None:
+        spec = JobSpec(upload_id=self.pick(self.uploads))
+        self.jobs.append(self.bench.submissions.create_job("me", spec).id)
+
+    def checkpoint(self) -> None:
+        job = self.pick(self.jobs)
+        row = self.bench.records.job(job)
+        if row.state == "queued":
+            self.bench.records.claim(job, row.attempt, "w")
+        self.blobs.put(keys.checkpoint_prefix(job, row.attempt) + "1/0", b"state")
+
+    def succeed(self) -> None:
+        job = self.pick(self.jobs)
+        self.results.commit(job, self.bench.records.job(job).attempt, {"model.obj": self.file})
+
+    def delete_job(self) -> None:
+        self.bench.records.delete(self.pick(self.jobs))
+
+    def pass_time(self) -> None:
+        self.bench.clock.now += self.data.draw(st.sampled_from([1.0, SETTLED_SECONDS, 90_000.0]))
+
+    def check(self) -> None:
+        """Whatever a row refers to is there."""
+        with self.bench.database.read() as session:
+            uploads = session.query(UploadRow).filter(UploadRow.deleted_at.is_(None), UploadRow.sha256.is_not(None))
+            for upload in uploads:
+                assert self.blobs.exists(keys.scan_key(upload.id)), "a scan was removed"
+            for job in session.query(JobRow).filter(JobRow.deleted_at.is_(None)):
+                for entry in job.results:
+                    assert self.blobs.exists(entry["key"]), "a result was removed"
+                if job.state == "succeeded":
+                    assert self.blobs.exists(keys.result_manifest_key(job.id))
+                elif job.state == "running":
+                    assert self.blobs.exists(keys.checkpoint_prefix(job.id, job.attempt) + "1/0")
+
+
+class Interrupted(FolderBlobs):
+    """Lets the world go on between the look at the blobs, the look at the rows, and every removal."""
+
+    world: World
+
+    def folders(self, prefix: str) -> Iterator[str]:
+        found = list(super().folders(prefix))
+        for _ in range(self.world.data.draw(st.integers(0, 4))):
+            self.world.step()
+        return iter(found)
+
+    def delete_prefix(self, prefix: str) -> None:
+        self.world.step()
+        super().delete_prefix(prefix)
+
+
+@settings(
+    max_examples=60,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large],
+)
+@given(data=st.data())
+def test_sweeping_never_removes_what_a_row_refers_to(sqlite_bench: Any, data: st.DataObject) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        blobs = Interrupted(Path(folder) / "blobs")
+        world = World(sqlite_bench, blobs, Path(folder), data)
+        blobs.world = world
+        with sqlite_bench.database.write() as session:  # of the example before
+            session.query(JobRow).delete()
+            session.query(UploadRow).delete()
+        for _ in range(data.draw(st.integers(1, 5))):
+            for _ in range(data.draw(st.integers(1, 12))):
+                world.step()
+                world.check()
+            world.retention.sweep()
+            world.check()
+
+
+def test_orphans_go_and_everything_else_stays(bench: Any, blobs: Blobs) -> None:
+    retention = Retention(bench.database, blobs)
+    upload = bench.finished_upload()
+    job = bench.job(upload_id=upload)
+    orphan = new_id(bench.clock.now)
+    kept = [keys.scan_key(upload), keys.checkpoint_prefix(job, 1) + "1/0", "scans/not-an-id/x", "elsewhere/x"]
+    lost = [keys.scan_key(orphan), keys.checkpoint_prefix(orphan, 1) + "1/0", keys.result_manifest_key(orphan)]
+    for key in kept + lost:
+        blobs.put(key, b"x")
+    assert retention.sweep() == 2
+    assert [blobs.exists(key) for key in kept] == [True] * len(kept)
+    assert [blobs.exists(key) for key in lost] == [False] * len(lost)
+    assert retention.sweep() == 0
+
+
+def test_what_comes_late_for_a_purged_job_goes_too(bench: Any, blobs: Blobs) -> None:
+    retention = Retention(bench.database, blobs)
+    job = bench.job()
+    bench.records.cancel(job)
+    bench.records.delete(job)
+    retention.purge()
+    late = keys.checkpoint_prefix(job, 1) + "1/0"
+    blobs.put(late, b"x")
+    assert retention.sweep() == 1
+    assert not blobs.exists(late)
+
+
+def test_leftovers_of_other_attempts_go_and_the_result_stays(bench: Any, blobs: Blobs, tmp_path: Path) -> None:
+    retention, results = Retention(bench.database, blobs), Results(bench.records, blobs)
+    (tmp_path / "a").write_bytes(b"a")
+    job = bench.job()
+    bench.records.claim(job, 1, "w")
+    for key in (keys.result_key(job, 7, "a"), keys.checkpoint_prefix(job, 1) + "1/0"):
+        blobs.put(key, b"late")
+    results.commit(job, 1, {"a": tmp_path / "a"})
+    assert retention.tidy() == 0, "another attempt may still be at it"
+    bench.clock.now += SETTLED_SECONDS + 1
+    assert retention.tidy() == 1
+    left = [info.key for info in blobs.list(keys.job_prefix(job))]
+    assert left == [keys.result_manifest_key(job), keys.result_key(job, 1, "a")]
+    assert retention.tidy() == 0
+
+
+@pytest.mark.parametrize("keep", [60, 5000])
+def test_a_job_is_kept_as_long_as_was_announced(bench: Any, blobs: Blobs, keep: int) -> None:
+    job = bench.job(retention_seconds=keep)
+    bench.records.cancel(job)
+    row = bench.records.job(job)
+    assert (row.retention_seconds, row.expires_at) == (keep, bench.clock.now + keep)
+    retention = Retention(bench.database, blobs)
+    bench.clock.now += keep
+    retention.expire()
+    assert bench.records.job(job).id == job
+    bench.clock.now += 1
+    retention.expire()
+    with pytest.raises(StoreError):
+        bench.records.job(job)

@@ -89,6 +89,10 @@ class LiveService:
     def start_worker(self, engine: str) -> subprocess.Popen[bytes]:
         return self._start([sys.executable, str(SUPPORT / "run_worker.py"), engine])
 
+    def restart_server(self) -> None:
+        """A new server process, at another address, after the old one was killed."""
+        self.url = self._start_server()
+
     def client(self, key: str | None = None) -> Client:
         return Client(self.url, key or self.key)
 
@@ -109,7 +113,7 @@ class LiveService:
 
     def _start_server(self) -> str:
         command = [sys.executable, "-m", "advtex_server.main", "serve", "--host", "127.0.0.1", "--port", "0"]
-        process = self._start(command, stdout=subprocess.PIPE)
+        process = self.server = self._start(command, stdout=subprocess.PIPE)
         assert process.stdout is not None
         line = process.stdout.readline()
         assert line, f"the server did not start:\n{self.log.read_text()}"

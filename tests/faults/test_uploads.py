@@ -1,0 +1,182 @@
+"""Uploads over bad lines, past dead processes, and by strangers: real processes, real sockets."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import httpx
+import psutil
+import pytest
+from cutting_proxy import CuttingProxy
+from live_service import LiveService, wait_until
+
+from advtex_client import Client
+from advtex_client.uploads import CHUNK
+from advtex_store import keys
+
+MB = 1_000_000
+TUS = {"Tus-Resumable": "1.0.0"}
+
+
+def sparse(path: Path, size: int) -> Path:
+    """A file of zeros that takes no room, with some bytes here and there by which places are told apart."""
+    with path.open("wb") as file:
+        for place in range(0, size, 10 * MB):
+            file.seek(place)
+            file.write(hashlib.sha256(str(place).encode()).digest())
+        file.truncate(size)
+    return path
+
+
+def digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+class Sent:
+    """Counts what the client hands to the line, whether it arrives or not; a short last chunk counts as a whole one."""
+
+    def __init__(self, watch: Callable[[], None] = lambda: None) -> None:
+        self.bytes = 0
+        self._watch = watch
+
+    def __call__(self, done: int, total: int) -> None:
+        self.bytes += CHUNK
+        self._watch()
+
+
+def over_a_line_that_is_cut(service: LiveService, tmp_path: Path, size: int, least: int, most: int) -> None:
+    archive = sparse(tmp_path / "scan.zip", size)
+    server = psutil.Process(service.server.pid)
+    with service.client() as client:
+        client.upload(sparse(tmp_path / "small.zip", 20 * MB))  # the first one loads what every one needs
+    before = peak = server.memory_info().rss
+
+    def look() -> None:
+        nonlocal peak
+        peak = max(peak, server.memory_info().rss)
+
+    sent = Sent(look)
+    with CuttingProxy(service.url, 1, least, most) as proxy, Client(proxy.url, service.key) as client:
+        began = time.monotonic()
+        upload = client.upload(archive, on_bytes=sent)
+        seconds = time.monotonic() - began
+    stored = service.store.blobs.path(keys.scan_key(upload.id))  # type: ignore[attr-defined]
+    resent = sent.bytes / size - 1
+    print(
+        f"{size / MB:.0f} MB in {seconds:.1f} s over {proxy.cuts} cuts: {100 * resent:.2f} % sent again, "
+        f"server grew by {(peak - before) / MB:.1f} MB"
+    )
+    assert upload.sha256 == digest(archive)
+    assert digest(stored) == upload.sha256
+    assert proxy.cuts >= 3
+    assert 0 <= resent <= 0.05
+    assert peak - before < 64 * MB
+
+
+def test_a_line_that_is_cut_again_and_again(service: LiveService, tmp_path: Path) -> None:
+    over_a_line_that_is_cut(service, tmp_path, 200 * MB, 25 * MB, 60 * MB)
+
+
+@pytest.mark.soak
+def test_two_gigabytes_over_a_line_that_is_cut(service: LiveService, tmp_path: Path) -> None:
+    over_a_line_that_is_cut(service, tmp_path, 2000 * MB, 20 * MB, 400 * MB)
+
+
+def begun(service: LiveService, size: int) -> str:
+    headers = {"Authorization": f"Bearer {service.key}", **TUS, "Upload-Length": str(size)}
+    return str(httpx.post(f"{service.url}/v1/uploads", headers=headers).headers["Location"])
+
+
+def raw_patch(service: LiveService, location: str, length: int, key: str) -> socket.socket:
+    parts = urlsplit(service.url)
+    connection = socket.create_connection((parts.hostname, parts.port), timeout=20)
+    head = f"PATCH {location} HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {key}\r\nTus-Resumable: 1.0.0\r\n"
+    head += f"Content-Type: application/offset+octet-stream\r\nUpload-Offset: 0\r\nContent-Length: {length}\r\n\r\n"
+    connection.sendall(head.encode())
+    return connection
+
+
+def test_a_half_open_line_does_not_keep_the_next_one_waiting(service: LiveService) -> None:
+    location = begun(service, 100 * MB)
+    connection = raw_patch(service, location, 100 * MB, service.key)
+    connection.sendall(b"x" * (30 * MB))  # and then nothing more, not even its end
+    headers = {"Authorization": f"Bearer {service.key}", **TUS}
+    with httpx.Client(base_url=service.url, headers=headers) as http:
+        wait_until(lambda: http.get(location).json()["offset"] > 20 * MB)
+        asked = time.monotonic()
+        offset = int(http.head(location).headers["Upload-Offset"])
+        seconds = time.monotonic() - asked
+        print(f"HEAD beside a half-open PATCH: {seconds * 1000:.0f} ms")
+        assert seconds < 0.5
+        assert offset == 30 * MB
+        stream = {"Content-Type": "application/offset+octet-stream", "Upload-Offset": str(offset)}
+        assert http.patch(location, content=b"x" * (70 * MB), headers=stream).status_code == 204
+        assert http.get(location).json()["complete"]
+    connection.close()
+
+
+def test_not_a_byte_of_a_stranger_is_written(service: LiveService) -> None:
+    location = begun(service, 100 * MB)
+    server = psutil.Process(service.server.pid)
+    before = server.io_counters().write_bytes
+    for key in ("adv_000000000000_" + "a" * 40, "", service.key[:-1] + ("a" if service.key[-1] != "a" else "b")):
+        connection = raw_patch(service, location, 100 * MB, key)
+        try:
+            for _ in range(50):
+                connection.sendall(b"x" * MB)
+        except OSError:  # the server has answered and gone
+            pass
+        connection.close()
+    headers = {"Authorization": f"Bearer {service.key}", **TUS}
+    assert int(httpx.head(f"{service.url}{location}", headers=headers).headers["Upload-Offset"]) == 0
+    assert list(service.store.blobs.list("scans/")) == []
+    assert server.io_counters().write_bytes - before < MB
+
+
+def test_a_server_that_is_killed_in_mid_upload(service: LiveService, tmp_path: Path) -> None:
+    archive = sparse(tmp_path / "scan.zip", 150 * MB)
+
+    def kill() -> None:
+        if sent.bytes > 75 * MB and service.server.poll() is None:
+            service.server.send_signal(signal.SIGKILL)
+            service.server.wait()
+
+    sent = Sent(kill)
+    with Client(service.url, service.key, retries=1) as client, pytest.raises(Exception, match="no answer"):
+        client.upload(archive, on_bytes=sent)
+    service.restart_server()
+    again = Sent()
+    with service.client() as client:
+        upload = client.upload(archive, on_bytes=again)
+    assert upload.sha256 == digest(archive)
+    assert sent.bytes + again.bytes < (150 + 30) * MB, "only what had not been made durable is sent again"
+
+
+def test_a_client_that_is_killed_in_mid_upload_goes_on(service: LiveService, tmp_path: Path, scan: Path) -> None:
+    sparse(scan / "large.bin", 200 * MB)
+    command = [sys.executable, "-m", "advtex_client.cli", "submit", str(scan)]
+    environment = os.environ | {"ADVTEX_URL": service.url, "ADVTEX_API_KEY": service.key}
+
+    def partly() -> bool:
+        return service.store.uploads.expected_bytes() in range(1, 150 * MB)
+
+    with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as process:
+        wait_until(partly, seconds=30)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    with service.client() as client:
+        sent = Sent()
+        job = client.submit(scan, on_bytes=sent)
+        assert sent.bytes < 160 * MB
+        assert client.get_upload(job.upload_id).complete
+        assert service.store.uploads.expected_bytes() == 0, "it went on with the upload of the first run"

@@ -74,8 +74,8 @@ class SizedDiscriminator(PatchDiscriminator):
                 nn.init.zeros_(narrow.bias)
                 self.convolutions[index] = narrow
 
-    def forward(self, condition: Tensor, residual: Tensor) -> Tensor:
-        x = torch.cat((condition, residual), 1)
+    def examine(self, condition: Tensor, residual: Tensor) -> tuple[Tensor, list[Tensor]]:
+        x, features = torch.cat((condition, residual), 1), []
         for index, layer in enumerate(self.convolutions):
             assert isinstance(layer, nn.Conv2d)
             last = index >= 3
@@ -84,7 +84,8 @@ class SizedDiscriminator(PatchDiscriminator):
             x = F.conv2d(x, layer.weight, layer.bias, layer.stride, padding, dilation)
             if index < 4:
                 x = F.leaky_relu(x, 0.2)
-        return x[..., 1:-1, 1:-1]
+                features.append(x)
+        return x[..., 1:-1, 1:-1], features
 
 
 def discriminator(patch: int, seed: int) -> PatchDiscriminator:

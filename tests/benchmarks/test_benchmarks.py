@@ -8,6 +8,7 @@ from typing import Any
 
 import discriminator
 import harness
+import parts
 import pytest
 import sparsity
 import study
@@ -137,3 +138,15 @@ def test_patches_have_their_size_and_the_common_centers(patch: int) -> None:
 def test_a_benchmark_without_weights_ends_with_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="no weights"):
         sparsity.main([*SMALL, "--lpips-weights", str(tmp_path), "--results", str(tmp_path)])
+
+
+@pytest.mark.slow
+def test_each_part_is_switched_off_once(tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    line = [*SMALL, "--models", "1", "--lpips-weights", str(weights), "--results", str(tmp_path)]
+    parts.main(line)
+    page = (tmp_path / "parts.md").read_text()
+    assert all(f"| {variant} |" in page for variant in parts.VARIANTS)
+    assert (tmp_path / "object_0.png").stat().st_size > 1000
+
+    monkeypatch.setattr(parts, "synthesize", lambda *_, **__: pytest.fail("every cell is there already"))
+    parts.main(line)

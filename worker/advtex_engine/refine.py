@@ -1,9 +1,14 @@
 """Camera refinement: poses and exposures that make the photographs agree on the surface (Zhou & Koltun 2014).
 
-Held-out views stay as they are, so the gauge is kept: content stays, on average over all that the cameras see, where
-the given cameras put it. Nothing is taken on trust: points that were set aside say per view whether its new pose is
-better than the given one, which it gets back if not, and whether all of it is better than nothing. The same goes for
-the exposures.
+The poses of held-out views stay as they are, so the gauge is kept: content stays, on average over all that the cameras
+see, where the given cameras put it. Nothing is taken on trust: cells of the surface that were set aside say per view
+whether its new pose is better than the given one, which it gets back if not, and whether all of it is better than
+nothing. The mean motion is removed last, from all views alike, so that their agreement, which they were judged by,
+stays. The same goes for the exposures.
+
+Before that, intrinsics and the color camera's place on the device are corrected if they are grossly wrong: held-out
+frames, which the same device has taken, get that correction too. What is off by less stays as given, since the poses
+make up for it and nothing else needs to know.
 """
 
 from __future__ import annotations
@@ -13,24 +18,20 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from advtex_engine.cameras import stack_cameras
+from advtex_engine.depth import depth_in_color_image
 from advtex_engine.refine_check import better, disagreement, improved
+from advtex_engine.refine_device import Device, refine_device
 from advtex_engine.refine_exposure import corrected_color, fit_exposure, sample_colors
-from advtex_engine.refine_points import Observations, draw_candidates, observe, order_of_preference, surface_depths
-from advtex_engine.refine_pose import local_contrast, look, refine_poses
-from advtex_engine.scene import Mesh, Scene
+from advtex_engine.refine_points import Observations
+from advtex_engine.refine_pose import keep_gauge, look, refine_poses
+from advtex_engine.refine_sight import Sight, look_at, motion
+from advtex_engine.scene import Camera, Scene, View
 
-WORKING_WIDTH = 320  # pixels; finer images take longer and gain little
-POINTS_PER_VIEW = 5000
-CHECKED_SHARE = 0.15  # of the points are set aside to judge the result
-CHECKED_PER_VIEW = 1500
-SPREAD_STRIDE = 16  # every so many of the points hold the content in place
-MIN_CANDIDATES = 1000  # points of the drawn ones that two views must see, to refine anything
 CONTRAST_SCALE, COLOR_SCALE = 0.5, 0.1  # disagreements beyond twice that are occlusions or highlights
-LUMINANCE = (0.299, 0.587, 0.114)
+DEVICE_POINTS = 1250  # per view
+DEVICE_MARGIN = 0.9  # of the disagreement may be left for a correction of the device to be taken
 
 
 @dataclass(frozen=True)
@@ -38,12 +39,16 @@ class Refinement:
     """What refinement found for V training views, and the report about it.
 
     world_to_camera: [V,4,4] float64. gain, offset: [V,3] float32, corrected color = gain * color + offset in [0,1].
+    lens [3,3] and device_offset [4,4]: the `Device` that all frames share, at their full size; None if as given. The
+    poses of training views hold the offset already.
     """
 
     world_to_camera: Tensor
     gain: Tensor
     offset: Tensor
     report: dict[str, Any]
+    lens: Tensor | None = None
+    device_offset: Tensor | None = None
 
 
 def refinement_to_dict(refinement: Refinement) -> dict[str, Any]:
@@ -53,157 +58,149 @@ def refinement_to_dict(refinement: Refinement) -> dict[str, Any]:
 
 def refinement_from_dict(saved: Mapping[str, Any]) -> Refinement:
     """Inverse of `refinement_to_dict`; other keys are ignored."""
-    return Refinement(**{key: saved[key] for key in Refinement.__dataclass_fields__})
-
-
-@dataclass(frozen=True)
-class _Sight:
-    """Images at the working size, their cameras, and the points to fit, to hold on to, and to check.
-
-    color: [V,3,h,w] float32 in [0,1]. features: `local_contrast` at full resolution. K, given: float64.
-    """
-
-    color: Tensor
-    features: Tensor
-    K: Tensor
-    given: Tensor
-    fitted: Observations
-    spread: Observations
-    checked: Observations
-
-    @property
-    def size(self) -> tuple[int, int]:
-        return self.color.shape[3], self.color.shape[2]
+    return Refinement(**{key: saved[key] for key in Refinement.__dataclass_fields__ if key in saved})
 
 
 def refine_cameras(scene: Scene, device: torch.device, seed: int) -> Refinement:
-    """Poses and exposures of the training views from their own photographs and the mesh; held-out views are not read.
+    """Poses, exposures and, if grossly wrong, the device, from the training views' photographs and the mesh.
 
-    On a CPU the same input and seed give the same result. Views that share too little with others keep their pose.
+    Held-out views are not read. On a CPU the same input and seed give the same result. Views that share too little with
+    others keep their pose.
     """
-    sight = _look_at(scene, device, seed)
+    sight = look_at(scene.mesh, scene.views, scene.kind, device, seed)
     if sight is None:
         return _unmoved(scene)
+    camera = scene.views[0].camera
+    scale = (camera.width / sight.size[0], camera.height / sight.size[1])
+    common, described = _device(sight)
+    if common is not None:
+        common = common.at_scale(*scale)
+        scene = replace(scene, views=tuple(_on_device(view, common) for view in scene.views))
+        sight = look_at(scene.mesh, scene.views, scene.kind, device, seed)
+        if sight is None:
+            return _unmoved(scene)
     found, poses = _poses(sight)
     gain, offset, exposures = _exposures(sight, found)
-    scale = scene.views[0].camera.width / sight.size[0]
-    motion = _motion(found, sight.given, sight.K, sight.fitted) * torch.tensor([1000.0, 1.0, scale])
+    moved = motion(found, sight) * torch.tensor([1.0, 1.0, scale[0]])
     columns = {**poses, **exposures, "gain": gain, "offset": offset}
-    columns |= {key: motion[:, row] for row, key in enumerate(("moved_mm", "turned_degrees", "moved_pixels"))}
+    columns |= {key: moved[:, row] for row, key in enumerate(("moved_mm", "turned_degrees", "moved_pixels"))}
     frames = [
         {"name": view.name, **{key: _plain(values[row]) for key, values in columns.items()}}
         for row, view in enumerate(scene.views)
     ]
     totals = {key: _plain(columns[key].double().nanmean()) for key in columns if columns[key].ndim == 1}
-    return Refinement(found.cpu(), gain.cpu(), offset.cpu(), {"mean": totals, "frames": frames})
+    described |= {} if common is None else _describe(common, scene.views[0].camera)
+    report = {"device": described, "mean": totals, "frames": frames}
+    shared = (None, None) if common is None else (common.lens.cpu(), common.offset.cpu())
+    return Refinement(found.cpu(), gain.cpu(), offset.cpu(), report, *shared)
 
 
 def apply_refinement(scene: Scene, refinement: Refinement) -> Scene:
-    """The scene with its training views' cameras moved and their colors corrected; held-out views as they are."""
+    """The scene with its training views' cameras moved and their colors corrected.
+
+    Held-out views are as they came but for a correction of the device.
+    """
+    given, heldout = scene.views, scene.heldout
+    if refinement.lens is not None and refinement.device_offset is not None:
+        common = Device(refinement.lens, refinement.device_offset)
+        given, heldout = (tuple(_on_device(view, common) for view in part) for part in (given, heldout))
     views = []
     for view, pose, gain, offset in zip(
-        scene.views, refinement.world_to_camera, refinement.gain, refinement.offset, strict=True
+        given, refinement.world_to_camera, refinement.gain, refinement.offset, strict=True
     ):
         color = corrected_color(view.color.to(torch.float32) / 255, gain, offset)
         camera = replace(view.camera, world_to_camera=pose)
         views.append(replace(view, camera=camera, color=(color * 255).round().to(torch.uint8)))
-    return replace(scene, views=tuple(views))
+    return replace(scene, views=tuple(views), heldout=heldout)
 
 
 def _unmoved(scene: Scene) -> Refinement:
     """Nothing to go by: everything as it came."""
     given = torch.stack([view.camera.world_to_camera for view in scene.views]).double()
     ones = torch.ones((len(given), 3))
-    return Refinement(given, ones, torch.zeros_like(ones), {"mean": {}, "frames": []})
+    return Refinement(given, ones, torch.zeros_like(ones), {"device": {"corrected": False}, "mean": {}, "frames": []})
 
 
-def _look_at(scene: Scene, device: torch.device, seed: int) -> _Sight | None:
-    """None when hardly anything is seen by two views."""
-    generator = torch.Generator().manual_seed(seed)
-    mesh = Mesh(scene.mesh.v_pos.to(device), scene.mesh.t_pos_idx.to(device))
-    camera = scene.views[0].camera
-    width = min(WORKING_WIDTH, camera.width)
-    size = (width, max(1, round(camera.height * width / camera.width)))
-    color = torch.cat([_shrunk(view.color.to(device), size) for view in scene.views])
-    features = local_contrast(_luminance(color), 1)
-    cameras, depths = surface_depths(mesh, scene.views, size, scene.kind)
-    K, given = stack_cameras(cameras, device)
-    candidates = draw_candidates(mesh, cameras, depths, features[:, 1:].norm(dim=1), generator)
-    if len(candidates.position) < MIN_CANDIDATES:
-        return None
-    order = order_of_preference(candidates, generator)
-    aside = round(CHECKED_SHARE * len(order))
-    checked = observe(candidates, order[:aside], cameras, depths, CHECKED_PER_VIEW)
-    fitted = observe(candidates, order[aside:], cameras, depths, POINTS_PER_VIEW)
-    few = torch.arange(0, len(order), SPREAD_STRIDE, device=order.device)
-    spread = observe(candidates, few, cameras, depths, POINTS_PER_VIEW // 4)
-    return _Sight(color, features, K, given, fitted, spread, checked)
+def _on_device(view: View, common: Device) -> View:
+    """The view with its color camera corrected; its depth's readings stay where they are in the world."""
+    old = view.camera
+    lens, offset = common.lens.to(old.K), common.offset.to(old.world_to_camera)
+    camera = Camera(lens @ old.K, offset @ old.world_to_camera, old.width, old.height)
+    depth = None if view.depth is None else depth_in_color_image(view.depth, old, camera)
+    return replace(view, camera=camera, depth=depth)
 
 
-def _poses(sight: _Sight) -> tuple[Tensor, dict[str, Tensor]]:
+def _device(sight: Sight) -> tuple[Device | None, dict[str, Any]]:
+    """A correction that the checked points clearly approve of, at the working size, and the report about it."""
+    fitted, checked = sight.fitted, sight.checked
+    few = Observations(fitted.position, fitted.point[:, :DEVICE_POINTS], fitted.seen[:, :DEVICE_POINTS])
+    found = refine_device(sight.luminance, sight.K, sight.given, few)
+    before = look(sight.features, sight.K, sight.given, checked, sight.size)
+    after = look(sight.features, found.lens @ sight.K, found.offset @ sight.given, checked, sight.size)
+    both = before.valid & after.valid
+    values = before.value[..., None], after.value[..., None]
+    old, new = (disagreement(value, both, checked, CONTRAST_SCALE).nanmean() for value in values)
+    taken = bool(new < DEVICE_MARGIN * old) and better(*values, both, checked, sight.checked_cell, CONTRAST_SCALE)
+    report = {"corrected": taken, "residual_before": _plain(old), "residual_after": _plain(new)}
+    return (found if taken else None), report
+
+
+def _describe(common: Device, camera: Camera) -> dict[str, Any]:
+    """The corrected intrinsics of the first view, and by how much the color camera was moved and turned."""
+    K, offset = camera.K, common.offset.cpu()
+    cosine = 0.5 * (offset[:3, :3].trace() - 1)
+    return {
+        **{
+            key: round(float(K[place]), 2)
+            for key, place in (("fx", (0, 0)), ("fy", (1, 1)), ("cx", (0, 2)), ("cy", (1, 2)))
+        },
+        "offset_mm": [round(1000 * float(part), 2) for part in offset[:3, 3]],
+        "turned_degrees": _plain(cosine.clamp(max=1).acos().rad2deg()),
+    }
+
+
+def _poses(sight: Sight) -> tuple[Tensor, dict[str, Tensor]]:
     """Poses [V,4,4] that the checked points approve of, and columns [V] for the report."""
-    given, checked = sight.given, sight.checked
-    found = refine_poses(_luminance(sight.color), sight.K, given, sight.fitted, sight.spread)
+    given, checked, cell = sight.given, sight.checked, sight.checked_cell
+    found = refine_poses(sight.luminance, sight.K, given, sight.fitted, sight.spread)
     before = look(sight.features, sight.K, given, checked, sight.size)
+    good = torch.ones(len(given), dtype=torch.bool, device=given.device)
+    # One view's return to its given pose changes what the others are compared with.
+    while True:
+        after = look(sight.features, sight.K, found, checked, sight.size)
+        values = before.value[..., None], after.value[..., None]
+        approved = improved(*values, before.valid & after.valid, checked, cell, CONTRAST_SCALE)
+        if approved[good].all():
+            break
+        good &= approved
+        found = torch.where(good[:, None, None], found, given)
+    if good.any():
+        found = keep_gauge(found, given, sight.fitted)
     after = look(sight.features, sight.K, found, checked, sight.size)
-    good = improved(
-        before.value[..., None], after.value[..., None], before.valid & after.valid, checked, CONTRAST_SCALE
-    )
-    found = torch.where(good[:, None, None], found, given)
-    after = look(sight.features, sight.K, found, checked, sight.size)
-    old = disagreement(before.value[..., None], before.valid, checked, CONTRAST_SCALE)
-    new = disagreement(after.value[..., None], after.valid, checked, CONTRAST_SCALE)
-    if not better(new, old):
-        found, good, new = given, torch.zeros_like(good), old
+    values = before.value[..., None], after.value[..., None]
+    old = disagreement(values[0], before.valid, checked, CONTRAST_SCALE)
+    if not better(*values, before.valid & after.valid, checked, cell, CONTRAST_SCALE):
+        return given, {"residual_before": old, "residual_after": old, "kept_pose": torch.ones_like(good)}
+    new = disagreement(values[1], after.valid, checked, CONTRAST_SCALE)
     return found, {"residual_before": old, "residual_after": new, "kept_pose": ~good}
 
 
-def _exposures(sight: _Sight, world_to_camera: Tensor) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+def _exposures(sight: Sight, world_to_camera: Tensor) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """Gain and offset [V,3] that the checked points approve of, and columns [V] for the report."""
-    checked = sight.checked
+    checked, cell = sight.checked, sight.checked_cell
     fit = look(sight.features, sight.K, world_to_camera, sight.fitted, sight.size)
     gain, offset = fit_exposure(sample_colors(sight.color, fit.pixel), fit.valid, sight.fitted)
     seen = look(sight.features, sight.K, world_to_camera, checked, sight.size)
     raw = sample_colors(sight.color, seen.pixel)
-    good = improved(raw, corrected_color(raw, gain[:, None], offset[:, None]), seen.valid, checked, COLOR_SCALE)[
-        :, None
-    ]
+    corrected = corrected_color(raw, gain[:, None], offset[:, None])
+    good = improved(raw, corrected, seen.valid, checked, cell, COLOR_SCALE)[:, None]
     gain, offset = torch.where(good, gain, 1.0), torch.where(good, offset, 0.0)
+    corrected = corrected_color(raw, gain[:, None], offset[:, None])
     old = disagreement(raw, seen.valid, checked, COLOR_SCALE)
-    new = disagreement(corrected_color(raw, gain[:, None], offset[:, None]), seen.valid, checked, COLOR_SCALE)
-    if not better(new, old):
+    new = disagreement(corrected, seen.valid, checked, COLOR_SCALE)
+    if not better(raw, corrected, seen.valid, checked, cell, COLOR_SCALE):
         gain, offset, new, good = torch.ones_like(gain), torch.zeros_like(offset), old, torch.zeros_like(good)
     return gain, offset, {"color_before": old, "color_after": new, "kept_exposure": ~good[:, 0]}
-
-
-def _motion(found: Tensor, given: Tensor, K: Tensor, points: Observations) -> Tensor:
-    """[V,3] float64 on the CPU: metres and degrees that each camera moved, and median pixels that its content did."""
-    change = found @ torch.linalg.inv(given)
-    centers = [-(pose[:, :3, :3].mT @ pose[:, :3, 3:])[..., 0] for pose in (found, given)]
-    # The angle's sine and cosine, since a small angle's cosine alone has lost it.
-    rotation = change[:, :3, :3]
-    skew = rotation - rotation.mT
-    sine = 0.5 * torch.stack((skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]), 1).norm(dim=1)
-    cosine = 0.5 * (rotation.diagonal(dim1=1, dim2=2).sum(1) - 1)
-    world = points.position[points.point]
-    pixels = []
-    for pose in (found, given):
-        homogeneous = (world @ pose[:, :3, :3].mT + pose[:, None, :3, 3]) @ K.mT
-        pixels.append(homogeneous[..., :2] / homogeneous[..., 2:])
-    shift = torch.where(points.seen, (pixels[0] - pixels[1]).norm(dim=-1), torch.nan).nanmedian(1).values
-    metres = (centers[0] - centers[1]).norm(dim=1)
-    return torch.stack((metres, torch.atan2(sine, cosine).rad2deg(), shift), 1).cpu()
-
-
-def _luminance(color: Tensor) -> Tensor:
-    """[V,3,h,w] -> [V,h,w]."""
-    return (color * color.new_tensor(LUMINANCE)[:, None, None]).sum(1)
-
-
-def _shrunk(color: Tensor, size: tuple[int, int]) -> Tensor:
-    """[H,W,3] uint8 -> [1,3,h,w] float32 in [0,1], averaged over areas."""
-    image = color.permute(2, 0, 1)[None].to(torch.float32) / 255
-    return F.interpolate(image, (size[1], size[0]), mode="area")
 
 
 def _plain(value: Tensor) -> Any:

@@ -25,6 +25,7 @@ SURFACE_TOLERANCE = 0.01  # relative to depth: how far behind the rendered surfa
 MIN_COSINE = 0.2  # between the surface's normal and the ray: beyond 78 degrees a pixel covers too much
 BORDER = 3.0  # pixels from the image's edge
 DETAIL_FLOOR = 0.1  # preference for a point without any detail, relative to the mean detail
+CELL_SIZE = 0.08  # of the median depth: about 25 of 320 pixels
 
 
 @dataclass(frozen=True)
@@ -125,6 +126,13 @@ def order_of_preference(candidates: Candidates, generator: torch.Generator) -> T
     weight = candidates.detail + DETAIL_FLOOR * candidates.detail.mean()
     wait = torch.rand(len(weight), generator=generator, dtype=torch.float64).clamp(min=1e-12).log().neg()
     return (wait.to(weight.device) / weight.clamp(min=1e-12)).argsort()
+
+
+def surface_cells(candidates: Candidates, depths: Tensor) -> Tensor:
+    """[N] int64: the cell of a grid in space, CELL_SIZE of the median of `depths` wide, that each point lies in."""
+    side = CELL_SIZE * depths[depths > 0].median().double()
+    cell: Tensor = torch.unique((candidates.position / side).floor().long(), dim=0, return_inverse=True)[1]
+    return cell
 
 
 def _looks(position: Tensor, normal: Tensor, cameras: list[Camera], depths: Tensor) -> Iterator[tuple[Tensor, Tensor]]:

@@ -23,6 +23,7 @@ CONTRAST_FLOOR = 0.04  # of the range: what is flatter than that counts less
 ROBUST_SCALE = 0.3  # residual, in local contrasts, at which an observation loses half of its weight
 ANCHOR = 0.1  # pull of each place towards where the given cameras show it on the average, relative to the evidence
 PRIOR = 0.001  # pull towards the given pose, relative to the mean strength of the evidence
+IMMOVABLE = 1e6
 LARGEST_STEP = 4.0  # pixels of the level
 
 
@@ -80,17 +81,18 @@ def look(features: Tensor, K: Tensor, world_to_camera: Tensor, points: Observati
     return Looks(value, torch.stack((across, down), -1), uv, local.float(), valid)
 
 
-def refine_poses(luminance: Tensor, K: Tensor, given: Tensor, points: Observations, spread: Observations) -> Tensor:
+def refine_poses(
+    luminance: Tensor, K: Tensor, given: Tensor, points: Observations, spread: Observations | None = None
+) -> Tensor:
     """world_to_camera [V,4,4] float64 that make the views agree; coarse to fine.
 
     luminance: [V,h,w] float32 in [0,1]. K: [V,3,3] float64 for that size. points: those compared. spread: points all
-    over the surface, whose content is to stay where it is on the average. The mean motion of all cameras is removed
-    before each level; the finest one comes after, since not every common motion leaves the photographs in agreement.
+    over the surface, whose content is to stay where it is on the average; the mean motion of all cameras is removed
+    after each level. Without, the first view alone moves, and the others hold the gauge.
     """
     size = (luminance.shape[2], luminance.shape[1])
     world_to_camera = given
     for scale, steps in LEVELS:
-        world_to_camera = keep_gauge(world_to_camera, given, points)
         features = local_contrast(luminance, scale)
         for _ in range(steps):
             looks = look(features, K, world_to_camera, points, size)
@@ -99,14 +101,20 @@ def refine_poses(luminance: Tensor, K: Tensor, given: Tensor, points: Observatio
             jacobian = pose_jacobian(looks, K) * unit[..., None]
             strength = (jacobian.square() @ weight[..., None])[..., 0]
             # A view without any point gets a prior alone and, its right side being 0, does not move.
-            prior = (PRIOR * strength.mean() + 1e-12).expand_as(strength)
+            prior = (PRIOR * strength.mean() + 1e-12).expand_as(strength).clone()
             moved = twist(world_to_camera @ torch.linalg.inv(given)).float() / unit
-            held = look(features, K, world_to_camera, spread, size)
-            anchor = _anchor(held, world_to_camera, unit, spread, float(strength.mean()))
+            anchor = None
+            if spread is None:
+                prior[1:] = IMMOVABLE * strength.max()
+            else:
+                held = look(features, K, world_to_camera, spread, size)
+                anchor = _anchor(held, world_to_camera, unit, spread, float(strength.mean()))
             step = solve_views(jacobian, residual, weight, points, prior, moved, anchor)
             longest = step.norm(dim=1).clamp(min=1e-12)
             step = step * (LARGEST_STEP * scale / longest).clamp(max=1)[:, None]
             world_to_camera = exponential((step * unit).double()) @ world_to_camera
+        if spread is not None:
+            world_to_camera = keep_gauge(world_to_camera, given, points)
     return world_to_camera
 
 
@@ -151,16 +159,17 @@ def _anchor(looks: Looks, world_to_camera: Tensor, unit: Tensor, points: Observa
 
 
 def keep_gauge(found: Tensor, given: Tensor, points: Observations) -> Tensor:
-    """Cameras [V,4,4] without their mean motion.
+    """Cameras [V,4,4] without their mean motion; those that see no points stay as they are.
 
     Removed is the rigid motion of the world that takes what the new cameras see to where the given ones see it
-    (Kabsch), weighted by 1/z^2, so that it is pixels that count.
+    (Kabsch), weighted by 1/z^2, so that it is pixels that count, and so that every camera counts the same.
     """
     world = points.position[points.point]
     local = world @ given[:, :3, :3].mT + given[:, None, :3, 3]
     moved = (local - found[:, None, :3, 3]) @ found[:, :3, :3]
-    weight = (points.seen / local[..., 2].clamp(min=1e-6).square()).flatten()[:, None]
-    weight = weight / weight.sum().clamp(min=1e-30)
+    weight = points.seen / local[..., 2].clamp(min=1e-6).square()
+    weight = weight / weight.sum(1, keepdim=True).clamp(min=1e-30)
+    weight = (weight / weight.sum().clamp(min=1e-30)).flatten()[:, None]
     source, target = moved.flatten(0, 1), world.flatten(0, 1)
     from_center, to_center = (source * weight).sum(0), (target * weight).sum(0)
     u, _, vt = torch.linalg.svd((weight * (target - to_center)).T @ (source - from_center))
@@ -170,7 +179,7 @@ def keep_gauge(found: Tensor, given: Tensor, points: Observations) -> Tensor:
     back = torch.eye(4, dtype=u.dtype, device=u.device)
     back[:3, :3] = rotation.T
     back[:3, 3] = from_center - rotation.T @ to_center
-    return found @ back
+    return torch.where(points.seen.any(1)[:, None, None], found @ back, found)
 
 
 def exponential(twist: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from advtex_server.access import AccessMiddleware
 from advtex_server.bodies import OpenBodies
 from advtex_server.deliveries import Deliverer
 from advtex_server.dispatch import Dispatcher
+from advtex_server.doorkeeper import Doorkeeper
 from advtex_server.intake import Intake
 from advtex_server.metrics import Metrics, MetricsMiddleware
 from advtex_server.routes import batches, health, jobs, uploads, webhooks
@@ -34,7 +35,7 @@ def create_app(settings: ServerSettings) -> FastAPI:
     store = open_store(settings)
     dispatcher = Dispatcher(store, settings)
     deliverer = Deliverer(store.webhooks, settings)
-    metrics = Metrics()
+    metrics = Metrics(store)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -67,7 +68,8 @@ def create_app(settings: ServerSettings) -> FastAPI:
     app.state.intake = Intake(store, settings)
     app.state.bodies = OpenBodies()
     errors.install(app)
-    app.add_middleware(AccessMiddleware, accounts=store.accounts, max_body_bytes=settings.max_body_bytes)
+    doorkeeper = Doorkeeper(store.accounts, settings.auth_failures_per_minute)
+    app.add_middleware(AccessMiddleware, doorkeeper=doorkeeper, max_body_bytes=settings.max_body_bytes)
     app.add_middleware(TusMiddleware)
     app.add_middleware(MetricsMiddleware, metrics=metrics)
     for module in (webhooks, uploads, jobs, batches, health):

@@ -43,6 +43,7 @@ from advtex_store.accounts import check_active_jobs
 from advtex_store.database import Database
 from advtex_store.errors import IllegalTransition, RecordNotFound, StaleAttempt
 from advtex_store.models import EventRow, JobRow
+from advtex_store.tallies import ATTEMPTS, tally, tally_end
 from advtex_store.webhooks import tell_webhooks
 
 S = JobState
@@ -182,6 +183,7 @@ class Records:
                 self._finish(session, self._move(session, job_id, S.canceled, fence=attempt))
                 return S.canceled
             self._move(session, job_id, S.preempted, fence=attempt, **_released(attempt + 1))
+            tally(session, ATTEMPTS, "preempted")
             return S.preempted
 
     def lost(self, job_id: str, attempt: int, *, log_tail: str | None = None, expired_only: bool = False) -> JobState:
@@ -195,6 +197,7 @@ class Records:
                 raise StaleAttempt(f"job {job_id}: the lease of attempt {attempt} still holds")
             if log_tail is not None:
                 row.log_tail = log_tail[-8000:]
+            tally(session, ATTEMPTS, "lost")
             deaths = 1 if row.reached > row.reached_at_claim else row.deaths + 1
             if row.cancel_requested:
                 self._finish(session, self._move(session, job_id, S.canceled, fence=attempt))
@@ -369,6 +372,7 @@ class Records:
         row.cancel_requested = False
         for name, value in values.items():
             setattr(row, name, value)
+        tally_end(session, row.state, row.error, row.progress.get("stage_seconds", {}))
         return row
 
     def _why_stale(self, session: Session, job_id: str, attempt: int) -> str:

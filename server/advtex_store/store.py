@@ -14,6 +14,7 @@ from advtex_store.references import References
 from advtex_store.results import Results
 from advtex_store.settings import StoreSettings
 from advtex_store.submissions import Submissions
+from advtex_store.tallies import Tallies
 from advtex_store.uploads import Uploads
 from advtex_store.webhooks import Webhooks
 
@@ -33,6 +34,7 @@ class Store:
     references: References
     results: Results
     webhooks: Webhooks
+    tallies: Tallies
     queue: JobQueue
 
     def close(self) -> None:
@@ -59,5 +61,6 @@ def open_store(settings: StoreSettings) -> Store:
         references=References(settings.reference_roots.split()),
         results=Results(records, blobs),
         webhooks=Webhooks(database),
+        tallies=Tallies(database),
         queue=JobQueue(connect_redis(settings)),
     )

@@ -20,6 +20,7 @@ from advtex_store.database import Database
 from advtex_store.errors import IdempotencyInFlight, IdempotencyMismatch, RecordNotFound
 from advtex_store.ids import new_id
 from advtex_store.models import EventRow, IdempotencyRow, JobRow, UploadRow
+from advtex_store.tallies import tally_end
 from advtex_store.webhooks import tell_webhooks
 
 HOLD_SECONDS = 300.0
@@ -149,6 +150,8 @@ class Submissions:
                 )
             )
             tell_webhooks(session, row, now)
+            if rejection is not None:
+                tally_end(session, row.state, row.error, {})
             if reservation is not None:
                 _bind(session, reservation, row.id)
             return row

@@ -10,6 +10,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from advtex_contract.errors import ErrorCode
+from advtex_contract.jobs import Progress
 from advtex_server.ranges import chosen_range
 from advtex_server.refusal import STATUS
 
@@ -102,6 +103,35 @@ def test_metrics(live: Any) -> None:
     missed = ("advtex_http_requests_total", ("method", "GET"), ("route", "/v1/jobs/{job_id}"), ("status", "404"))
     assert samples[missed] == 3
     assert samples[("advtex_disk_free_bytes",)] > 0
+    assert samples[("advtex_redis_up",)] == 0
+    assert samples["advtex_jobs_ended_total", ("state", "rejected")] == 1
+    assert samples["advtex_failures_total", ("cause", "invalid_scan")] == 1
+
+
+def test_metrics_of_the_fleet(make_live: Callable[..., Any], redis_url: str, scan_zip: Path) -> None:
+    live = make_live(redis_url=redis_url)
+    upload = live.upload(scan_zip.read_bytes())
+    jobs = [live.job(upload)["id"] for _ in range(3)]
+    records = live.store.records
+    records.claim(jobs[0], 1, "w")
+    records.heartbeat(jobs[0], 1, Progress(stage="atlas", steps_per_second=2.5, stage_seconds={"ingest": 4.0}))
+    records.claim(jobs[1], 1, "w")
+    records.lost(jobs[1], 1)
+    records.claim(jobs[1], 2, "w")
+    records.preempt(jobs[1], 2)
+    live.store.queue.announce("w", 8)
+    told = live.http.get("/metrics").text.splitlines()
+    assert "advtex_queue_depth 2.0" in told
+    assert "advtex_steps_per_second 2.5" in told
+    assert 'advtex_workers{gib="8"} 1.0' in told
+    assert {f'advtex_attempts_ended_early_total{{how="{how}"}} 1.0' for how in ("lost", "preempted")} <= set(told)
+    (age,) = [float(line.split()[1]) for line in told if line.startswith("advtex_queue_age_seconds ")]
+    assert 0 < age < 60
+    records.succeed(jobs[0], 1, [])
+    told = live.http.get("/metrics").text.splitlines()
+    assert 'advtex_stage_seconds_count{stage="ingest"} 1.0' in told
+    assert 'advtex_stage_seconds_sum{stage="ingest"} 4.0' in told
+    assert 'advtex_jobs_ended_total{state="succeeded"} 1.0' in told
 
 
 @pytest.mark.parametrize(

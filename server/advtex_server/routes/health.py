@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse
 
 from advtex_server.deps import TheService
 from advtex_server.health import checks
-from advtex_server.metrics import exposition
+from advtex_server.metrics import Metrics
 
 router = APIRouter(tags=["operation"])
 
@@ -31,7 +33,7 @@ def readyz(service: TheService) -> Response:
 
 
 @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
-def metrics(service: TheService, request: Request) -> Response:
+def metrics(request: Request) -> Response:
     """Prometheus metrics."""
-    body, media_type = exposition(request.app.state.metrics, service.store)
+    body, media_type = cast(Metrics, request.app.state.metrics).exposition()
     return Response(body, media_type=media_type)

@@ -33,21 +33,24 @@ def state(of: AdversarialOptimizer) -> list[torch.Tensor]:
     return [of.values.detach().clone(), *(p.detach().clone() for p in of.parameters)]
 
 
-def test_a_run_that_is_saved_and_loaded_ends_bit_identical() -> None:
-    whole = optimizer()
+@pytest.mark.parametrize("averaging", [0, 20])
+def test_a_run_that_is_saved_and_loaded_ends_bit_identical(averaging: int) -> None:
+    preset = dataclasses.replace(PRESET, averaging=averaging)
+    whole = optimizer(preset=preset)
     for _ in range(8):
         whole.step()
-    first = optimizer()
+    first = optimizer(preset=preset)
     for _ in range(3):
         first.step()
     file = io.BytesIO()
     torch.save(first.state_dict(), file)
     file.seek(0)
-    second = optimizer(seed=9)
+    second = optimizer(seed=9, preset=preset)
     second.load_state_dict(torch.load(file, weights_only=True))
     for _ in range(5):
         second.step()
     assert second.index == whole.index == 8
+    assert torch.equal(whole.result, second.result)
     assert all(torch.equal(a, b) for a, b in zip(state(whole), state(second), strict=True))
 
 
@@ -177,6 +180,22 @@ def test_the_crop_moves_by_about_a_tenth_and_keeps_the_patch_grid(width: int, he
     crop = crop_size(width, height)
     assert (width - crop[0]) % 8 == (height - crop[1]) % 8 == 0
     assert 0.05 <= (width - crop[0]) / width <= 0.15
+
+
+def test_the_result_is_the_mean_of_every_tenth_state_and_then_a_moving_one() -> None:
+    of = optimizer(preset=dataclasses.replace(PRESET, pretraining=2, averaging=30))
+    states = []
+    for step in range(53):
+        of.step()
+        if step >= 2 and (step - 2) % 10 == 0:
+            states.append(of.values.detach().clone())
+        if step == 22:
+            torch.testing.assert_close(of.result, torch.stack(states).mean(0))
+    expected = torch.stack(states[:3]).mean(0)
+    for state_later in states[3:]:
+        expected = expected * (2 / 3) + state_later / 3
+    torch.testing.assert_close(of.result, expected)
+    assert torch.equal(optimizer().result, optimizer().values)
 
 
 def test_pretraining_moves_the_discriminator_alone() -> None:

@@ -36,6 +36,7 @@ class Preset:
     l1_decay          lambda is multiplied by this `l1_decays` times over the run (paper: 0.8 every 1,000 of 50,000)
     feature_weight    of the distance between what the discriminator's layers respond to the render and to the real
                       example (paper: 0); tolerant to shifts as they are, it averages less than L1 does
+    averaging         steps over which the resulting texture is averaged (paper: none, the last state)
     alignment         both examples are moved onto the source image before they are judged (Zhao et al. 2022)
     max_crop          largest crop (width, height) in pixels; larger views are seen in parts, for cheaper steps
     max_pair_angle    largest angle between the optical axes of a pair, degrees (released code: 15)
@@ -56,6 +57,7 @@ class Preset:
     l1_decay: float = 0.8
     l1_decays: float = 50.0
     feature_weight: float = 0.0
+    averaging: int = 0
     alignment: bool = False
     max_crop: tuple[int, int] | None = None
     max_pair_angle: float = 15.0
@@ -76,12 +78,14 @@ PRESETS: dict[str, Preset] = {
         levels=(PyramidLevel(4_000),),
         start="selection",
         pretraining=400,
+        lr_texture=4e-4,
         lr_texture_end=0.05,
         lr_discriminator=2e-4,
         l1_weight=1.0,
         l1_target="start",
         l1_decays=0,
         feature_weight=10.0,
+        averaging=600,
         alignment=True,
         max_crop=(384, 288),
     ),

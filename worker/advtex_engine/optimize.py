@@ -28,6 +28,7 @@ from advtex_engine.texture import sample_texels
 from advtex_engine.views import Pairs, ViewMaps
 
 CROP_SHARE = 0.1  # the released code shifts its crop by up to 69 of 640 pixels, about a tenth of the width
+AVERAGE_EVERY = 10  # steps between two states that enter the texture's average
 WHOLLY_VISIBLE = 0.99  # a moved pixel that mixes in what is not visible does not count
 LOSS_NAMES = ("discriminator", "adversarial", "l1", "features", "skipped")
 
@@ -85,6 +86,7 @@ class AdversarialOptimizer:
         self.generator = generator
         self.values = values.clone().to(device).requires_grad_(True)
         self.start = self.values.detach().clone() if preset.l1_target == "start" else None
+        self.average = self.values.detach().clone() if preset.averaging else None
         self.discriminator = discriminator
         self.parameters = list(discriminator.parameters())
         self.adam_texture = _adam([self.values], preset.lr_texture, preset.beta1)
@@ -126,6 +128,7 @@ class AdversarialOptimizer:
             gradient = self.texture_gradient(losses)
             self.update_discriminator(losses)
             self.update_texture(gradient)
+            self._take_average()
         named = (losses.discriminator, losses.adversarial, losses.l1, losses.features, losses.ahead)
         self._sums += torch.stack(named).detach()
         self._summed += 1
@@ -177,6 +180,18 @@ class AdversarialOptimizer:
         self.adam_texture.param_groups[0]["lr"] = self.lr_texture
         self.adam_texture.step()
 
+    @property
+    def result(self) -> Tensor:
+        """The compact texture that the run stands for, [slots,3]: its average, or its last state."""
+        return self.values.detach() if self.average is None else self.average
+
+    def _take_average(self) -> None:
+        """The mean of the states so far, then a moving one over `averaging` steps."""
+        taken, rest = divmod(self.index - self.preset.pretraining, AVERAGE_EVERY)
+        if self.average is not None and rest == 0:
+            window = max(1, self.preset.averaging // AVERAGE_EVERY)
+            self.average.lerp_(self.values.detach(), 1 / min(taken + 1, window))
+
     def update_discriminator(self, losses: Losses) -> None:
         """One step of Adam over the discriminator, unless it is ahead."""
         if self.device.type == "cpu" and bool(losses.ahead):
@@ -210,6 +225,8 @@ class AdversarialOptimizer:
         }
         if self.start is not None:
             state["start"] = self.start
+        if self.average is not None:
+            state["average"] = self.average
         return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -220,6 +237,8 @@ class AdversarialOptimizer:
             self.values.copy_(state["values"])
             if self.start is not None:
                 self.start.copy_(state["start"])
+            if self.average is not None:
+                self.average.copy_(state["average"])
         self.discriminator.load_state_dict(state["discriminator"])
         self.adam_texture.load_state_dict(state["adam_texture"])
         self.adam_discriminator.load_state_dict(state["adam_discriminator"])

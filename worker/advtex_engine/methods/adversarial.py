@@ -63,7 +63,7 @@ def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
             optimizer.load_state_dict(saved["optimizer"])
             saved = None
         _run_level(given, optimizer, run, sum(part.steps for part in preset.levels[: number + 1]), timer)
-        texture = dense_texture(maps, optimizer.values.detach())
+        texture = dense_texture(maps, optimizer.result)
         run.level = number + 1
     return texture.clamp(0, 1), run.losses
 

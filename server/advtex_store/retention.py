@@ -97,6 +97,8 @@ class Retention:
                 with self.database.read() as session:
                     alive = set(session.scalars(select(table.id).where(table.id.in_(ids), table.purged_at.is_(None))))
                 for orphan in set(ids) - alive:
+                    if table is UploadRow:
+                        self.blobs.drop_partial(keys.scan_key(orphan))
                     self.blobs.delete_prefix(f"{prefix}{orphan}/")
                     swept += 1
         return swept

@@ -24,6 +24,7 @@ from advtex_store.errors import BlobNotFound
 from advtex_store.models import JobRow
 
 LEASE_SECONDS = 3.0
+PROGRESS_SECONDS = 60.0
 
 
 class Chaos:
@@ -35,6 +36,7 @@ class Chaos:
         self._random = random.Random(seed)
         self._done = threading.Event()
         self._thread = threading.Thread(target=self._run, name="chaos")
+        self._seen = (0, 0)
         self.failure: BaseException | None = None
         self.done: dict[str, int] = defaultdict(int)
         self._actions: dict[Callable[[], None], float] = {
@@ -69,7 +71,7 @@ class Chaos:
         self._random.shuffle(order)
         try:
             while not self._done.wait(self._random.uniform(0.2, 1.5)):
-                self._wait_for_a_server()
+                self._wait_for_progress()
                 chosen = order.pop() if order else self._random.choices(*zip(*self._actions.items(), strict=True))[0]
                 chosen()
                 self.done[chosen.__name__] += 1
@@ -79,9 +81,15 @@ class Chaos:
         finally:
             self._revive()
 
-    def _wait_for_a_server(self) -> None:
-        """On a busy machine, servers would else be killed again and again before they have started."""
-        while not self._done.is_set() and not any(is_up(url) for url in self._fleet.urls):
+    def _wait_for_progress(self) -> None:
+        """Until a server answers, and a job was made or a step was done since the last fault. On a busy machine,
+        everything would else be killed again and again before it has started."""
+        deadline = time.monotonic() + PROGRESS_SECONDS
+        while not self._done.is_set() and time.monotonic() < deadline:
+            seen = (self._fleet.journal.stat().st_size, sum(self._fleet.store.records.count_by_state().values()))
+            if seen != self._seen and any(is_up(url) for url in self._fleet.urls):
+                self._seen = seen
+                return
             self._done.wait(0.1)
 
     # -- faults -------------------------------------------------------------------------------------------------

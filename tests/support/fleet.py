@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from urllib.parse import urlsplit, urlunsplit
 
 import httpx
@@ -40,7 +41,15 @@ class Fleet:
     """`servers` and `workers` are started by `start`; `store` looks at the same rows and blobs, over uncut lines."""
 
     def __init__(
-        self, folder: Path, place: Place, stack: ExitStack, *, servers: int, workers: int, engine: str
+        self,
+        folder: Path,
+        place: Place,
+        stack: ExitStack,
+        *,
+        servers: int,
+        workers: int,
+        engine: str,
+        variables: Mapping[str, str],
     ) -> None:
         self.place = place
         self.log = folder / "fleet.log"
@@ -55,6 +64,7 @@ class Fleet:
             if port := urlsplit(url).port:
                 self.lines[name] = stack.enter_context(TcpProxy(port))
         self._engine = engine
+        self._given = variables
         self.redis: subprocess.Popen[bytes]
         self.servers: list[subprocess.Popen[bytes]] = []
         self.workers: list[subprocess.Popen[bytes]] = []
@@ -75,7 +85,7 @@ class Fleet:
         self.servers = [self.start_server(number) for number in range(len(self.ports))]
         self.workers = [self.start_worker(number) for number in range(self._workers)]
         for url in self.urls:
-            wait_until(lambda: is_up(url), seconds=30)  # noqa: B023
+            wait_until(lambda: is_up(url), seconds=90)  # noqa: B023
 
     @property
     def urls(self) -> list[str]:
@@ -121,6 +131,7 @@ class Fleet:
             "ADVTEX_REDIS_URL": url_for("redis", self.settings.redis_url),
             "ADVTEX_LEASE_SECONDS": "3",
             "ADVTEX_QUEUE_DEPTH": "2",
+            **self._given,
         }
 
     def _start(self, command: list[str], variables: Mapping[str, str]) -> subprocess.Popen[bytes]:
@@ -132,11 +143,19 @@ class Fleet:
 
 
 @contextmanager
-def fleet(folder: Path, place: Place, *, servers: int = 1, workers: int = 3, engine: str) -> Iterator[Fleet]:
-    """Started, and stopped at the end with everything it has started."""
+def fleet(
+    folder: Path,
+    place: Place,
+    *,
+    servers: int = 1,
+    workers: int = 3,
+    engine: str,
+    variables: Mapping[str, str] = MappingProxyType({}),
+) -> Iterator[Fleet]:
+    """Started, and stopped at the end with everything it has started. `variables`: settings of all its processes."""
     with ExitStack() as stack:
         before = dict(os.environ)
-        running = Fleet(folder, place, stack, servers=servers, workers=workers, engine=engine)
+        running = Fleet(folder, place, stack, servers=servers, workers=workers, engine=engine, variables=variables)
         try:
             running.start()
             yield running

@@ -1,0 +1,201 @@
+"""How the API answers under load: `python tests/benchmarks/load.py`. One server process, SQLite, everything on this
+machine, the load's own cost included.
+
+200 clients ask for a job that is running, each once a second, 20 listen to its events, and 4 upload without pause;
+afterwards 10,000 finished jobs are listed page by page. Prints one JSON object.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+
+from advtex_contract.jobs import JobSpec, JobState, Progress
+from advtex_server.settings import ServerSettings
+from advtex_store.database import upgrade_database
+from advtex_store.ids import new_id
+from advtex_store.models import JobRow
+from advtex_store.store import Store, open_store
+
+POLLERS = 200
+STREAMS = 20
+UPLOADS = 4
+UPLOAD_BYTES = 16 << 20
+SECONDS = 20.0
+FINISHED = 10_000
+PAGE = 50
+
+
+class Line:
+    """A kept connection that speaks just enough HTTP, so that the load costs little beside what it measures."""
+
+    def __init__(self, port: int, key: str) -> None:
+        self._port = port
+        self._headers = f"Host: 127.0.0.1\r\nAuthorization: Bearer {key}\r\n"
+
+    async def open(self) -> None:
+        self._reader, self._writer = await asyncio.open_connection("127.0.0.1", self._port)
+
+    def close(self) -> None:
+        self._writer.close()
+
+    async def request(self, method: str, path: str, body: bytes = b"") -> bytes:
+        """-> the body of a 2xx answer."""
+        length = f"Content-Length: {len(body)}\r\n" if body else ""
+        self._writer.write(f"{method} {path} HTTP/1.1\r\n{self._headers}{length}\r\n".encode() + body)
+        await self._writer.drain()
+        head = await self._reader.readuntil(b"\r\n\r\n")
+        size = int(head.lower().partition(b"content-length:")[2].split(b"\r\n")[0])
+        answer = await self._reader.readexactly(size)
+        if head[9:10] != b"2":
+            raise RuntimeError(f"{method} {path}: {head[:15]!r} {answer[:300]!r}")
+        return answer
+
+    async def listen(self, path: str) -> None:
+        """Read a stream of events until it is canceled."""
+        self._writer.write(f"GET {path} HTTP/1.1\r\n{self._headers}\r\n".encode())
+        while await self._reader.read(1 << 16):
+            pass
+
+
+async def poll(line: Line, path: str, until: float, start: float, times: list[float]) -> None:
+    await asyncio.sleep(start)
+    while (began := time.perf_counter()) < until:
+        await line.request("GET", path)
+        times.append(time.perf_counter() - began)
+        await asyncio.sleep(max(0.0, 1.0 - (time.perf_counter() - began)))
+
+
+async def upload(line: Line, until: float, sizes: list[int]) -> None:
+    body = os.urandom(UPLOAD_BYTES)
+    while time.perf_counter() < until:
+        await line.request("POST", "/v1/uploads", body)
+        sizes.append(UPLOAD_BYTES)
+
+
+async def page_through(line: Line, times: list[float]) -> int:
+    cursor, seen = "", 0
+    while True:
+        began = time.perf_counter()
+        page = json.loads(await line.request("GET", f"/v1/jobs?state=succeeded&limit={PAGE}{cursor}"))
+        times.append(time.perf_counter() - began)
+        seen += len(page["jobs"])
+        if page["next_cursor"] is None:
+            return seen
+        cursor = f"&cursor={page['next_cursor']}"
+
+
+async def measure(port: int, key: str, job: str) -> dict[str, object]:
+    lines = [Line(port, key) for _ in range(POLLERS + STREAMS + UPLOADS + 1)]
+    for line in lines:
+        await line.open()
+    asking: list[float] = []
+    sizes: list[int] = []
+    listing: list[float] = []
+    path = f"/v1/jobs/{job}"
+    until = time.perf_counter() + SECONDS
+    listeners = [asyncio.create_task(line.listen(f"{path}/events")) for line in lines[POLLERS : POLLERS + STREAMS]]
+    pollers = [poll(line, path, until, n / POLLERS, asking) for n, line in enumerate(lines[:POLLERS])]
+    await asyncio.gather(*pollers, *(upload(line, until, sizes) for line in lines[POLLERS + STREAMS : -1]))
+    for task in listeners:
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+    seen = await page_through(lines[-1], listing)
+    for line in lines:
+        line.close()
+    assert seen == FINISHED
+    return {
+        "get_job": summary(asking),
+        "list_jobs": summary(listing),
+        "requests_per_second": round(len(asking) / SECONDS, 1),
+        "uploaded_mb_per_second": round(sum(sizes) / SECONDS / 1e6, 1),
+        "load_average": os.getloadavg()[0],
+    }
+
+
+def summary(times: list[float]) -> dict[str, float]:
+    """Milliseconds."""
+    cuts = statistics.quantiles(times, n=100)
+    return {"count": len(times), "p50_ms": round(cuts[49] * 1e3, 1), "p99_ms": round(cuts[98] * 1e3, 1)}
+
+
+def fill(store: Store) -> str:
+    """10,000 finished jobs. -> a running one."""
+    upload_row = store.uploads.create("load", 1)
+    store.uploads.finish(upload_row.id, "ab" * 32)
+    running = store.submissions.create_job("load", JobSpec(upload_id=upload_row.id))
+    result = {"name": "model.glb", "key": "k", "size": 1, "sha256": "ab" * 32, "content_type": "model/gltf-binary"}
+    with store.database.write() as session:
+        now = store.database.now(session)
+        for number in range(FINISHED):
+            made = now - FINISHED + number
+            session.add(
+                JobRow(
+                    id=new_id(made),
+                    owner="load",
+                    upload_id=upload_row.id,
+                    state=JobState.succeeded,
+                    options=running.options,
+                    progress=Progress(stage="previews").model_dump(mode="json"),
+                    warnings=[],
+                    results=[result] * 6,
+                    created_at=made,
+                    updated_at=made,
+                    finished_at=made,
+                    retention_seconds=86400 * 30,
+                    expires_at=made + 86400 * 30,
+                    tidied_at=made,
+                )
+            )
+    store.records.claim(running.id, 1, "load")
+    return running.id
+
+
+def keep_running(store: Store, job: str, done: threading.Event) -> None:
+    """What a worker's heartbeats do."""
+    step = 0
+    while not done.wait(0.5):
+        step += 1
+        progress = Progress(stage="optimization", step=step, steps=4000, losses={"l1": 1.0 / step})
+        store.records.heartbeat(job, 1, progress, reached=step)
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        settings = ServerSettings(data_dir=Path(folder), redis_url="redis://127.0.0.1:1/0")
+        upgrade_database(settings.database)
+        store = open_store(settings)
+        key = store.accounts.create_key("load", owner="load")
+        job = fill(store)
+        environment = os.environ | {"ADVTEX_DATA_DIR": folder, "ADVTEX_REDIS_URL": settings.redis_url}
+        command = [sys.executable, "-m", "advtex_server.main", "serve", "--host", "127.0.0.1", "--port", "0"]
+        server = subprocess.Popen(
+            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        )
+        done = threading.Event()
+        heart = threading.Thread(target=keep_running, args=(store, job, done))
+        heart.start()
+        try:
+            assert server.stdout is not None
+            port = int(json.loads(server.stdout.readline())["url"].rpartition(":")[2])
+            print(json.dumps(asyncio.run(measure(port, key, job)), indent=1))
+        finally:
+            done.set()
+            heart.join()
+            server.terminate()
+            server.wait()
+            store.close()
+
+
+if __name__ == "__main__":
+    main()

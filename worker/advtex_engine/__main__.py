@@ -100,6 +100,9 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--reference", type=Path, help="mesh that decides which pixels count; default: the scan's")
     evaluate.add_argument("--lpips-weights", type=Path, help="folder; default: $ADVTEX_LPIPS_WEIGHTS, else the cache")
     evaluate.add_argument("--download-weights", action="store_true", help="fetch the weights of LPIPS if they lack")
+    evaluate.add_argument(
+        "--refine-heldout", action="store_true", help="refine the frames' poses against the model first, and say so"
+    )
     evaluate.add_argument("--json", type=Path, help="write the scores per view and their means")
     evaluate.add_argument("--contact-sheet", type=Path, help="write a PNG: photograph, render, difference")
     synthesize = commands.add_parser("synthesize", help="make a scan with known truth")
@@ -153,11 +156,22 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     if arguments.download_weights:
         download(LPIPS_SOURCES, weights_folder(arguments.lpips_weights))
     given = {name: getattr(arguments, name) for name in ("model", "scan", "size", "holdout", "reference")}
-    evaluation = evaluate(**given, weights=arguments.lpips_weights, sheet=arguments.contact_sheet, monitor=_Printer())
+    evaluation = evaluate(
+        **given,
+        weights=arguments.lpips_weights,
+        sheet=arguments.contact_sheet,
+        refine_poses=arguments.refine_heldout,
+        monitor=_Printer(),
+    )
     if arguments.json is not None:
         write_json(arguments.json, evaluation, given)
     for name, value in evaluation.mean.items():
         print(f"{name:24}{'-' if value is None else format(value, '.4g')}")
+    if evaluation.refined is not None:
+        print("poses were refined against the model before scoring:")
+        for row in evaluation.refined:
+            words = "kept its pose" if row["kept_pose"] else f"moved by {row['moved_pixels']:.2f} pixels"
+            print(f"  {row['name']} {words}")
     for name, reason in evaluation.missing.items():
         print(f"{name} is missing: {reason}", file=sys.stderr)
     return 0

@@ -28,6 +28,7 @@ from advtex_engine.monitor import Monitor
 from advtex_engine.perceptual import Lpips, WeightsError, load_lpips
 from advtex_engine.previews import contact_sheet, evenly_spread, render_layers
 from advtex_engine.rasterize import rasterize
+from advtex_engine.refine_heldout import refine_heldout
 from advtex_engine.scene import Atlas, Fragments, Mesh, Scene, View
 from advtex_engine.sharpness import band_error, flat_energy, s3_ratio
 from advtex_scan.archive import open_scan
@@ -76,11 +77,15 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Scores per view and their means; `missing` says why a metric has none."""
+    """Scores per view and their means; `missing` says why a metric has none.
+
+    refined: per view how far its camera was moved against the model before scoring, None if no camera was.
+    """
 
     per_view: list[dict[str, Any]]
     mean: dict[str, Any]
     missing: dict[str, str]
+    refined: list[dict[str, Any]] | None = None
 
 
 def evaluate(
@@ -92,6 +97,7 @@ def evaluate(
     reference: Path | None = None,
     weights: Path | None = None,
     sheet: Path | None = None,
+    refine_poses: bool = False,
     monitor: Monitor | None = None,
 ) -> Evaluation:
     """Scores an OBJ or GLB against a scan's held-out frames, or against all frames without `holdout`.
@@ -99,7 +105,9 @@ def evaluate(
     size: width and height of the renders and photographs in pixels; None keeps the scan's. reference: a mesh file that
     decides which pixels count, by default the scan's mesh; models compared with each other need the same one. weights:
     see `perceptual.weights_folder`; without them `lpips` and `lpips_full` are None. sheet: PNG to write, photograph |
-    render | difference. Raises ScanError, ModelError, OptionError, and EngineError when no view can be scored.
+    render | difference. refine_poses: the frames' poses are refined against the model first, to tell a texture that is
+    displaced from one that is wrong. Raises ScanError, ModelError, OptionError, and EngineError when no view can be
+    scored.
     """
     scene = _load_views(scan, TextureConfig(size=size, holdout=holdout), monitor or Monitor())
     target = scene.mesh if reference is None else load_reference(reference)
@@ -107,9 +115,12 @@ def evaluate(
     if model.suffix.lower() == ".glb":
         atlas = replace(atlas, mesh=_from_y_up(atlas.mesh, scene.up_axis))
     lpips, missing = configured_lpips(weights)
-    shown = {view.name for view in evenly_spread(scene.views, SHEET_VIEWS)} if sheet is not None else set()
+    views, refined = scene.views, None
+    if refine_poses:
+        views, refined = refine_heldout(atlas, texture, views, scene.kind)
+    shown = {view.name for view in evenly_spread(views, SHEET_VIEWS)} if sheet is not None else set()
     rows, pictures = list[dict[str, Any]](), list[tuple[View, Comparison]]()
-    for view in scene.views:
+    for view in views:
         comparison = compare(atlas, texture, view, target)
         if comparison is None:
             continue
@@ -122,7 +133,7 @@ def evaluate(
         )
     if sheet is not None and pictures:
         _write_sheet(pictures, sheet)
-    return Evaluation(rows, mean_scores(rows), missing)
+    return Evaluation(rows, mean_scores(rows), missing, refined)
 
 
 def configured_lpips(folder: Path | None = None) -> tuple[Lpips | None, dict[str, str]]:

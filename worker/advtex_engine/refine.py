@@ -26,10 +26,10 @@ from advtex_engine.refine_device import Device, refine_device
 from advtex_engine.refine_exposure import corrected_color, fit_exposure, sample_colors
 from advtex_engine.refine_points import Observations
 from advtex_engine.refine_pose import keep_gauge, look, refine_poses
-from advtex_engine.refine_sight import Sight, look_at, motion
+from advtex_engine.refine_sight import CONTRAST_SCALE, Sight, look_at, motion
 from advtex_engine.scene import Camera, Scene, View
 
-CONTRAST_SCALE, COLOR_SCALE = 0.5, 0.1  # disagreements beyond twice that are occlusions or highlights
+COLOR_SCALE = 0.1  # disagreements beyond twice that are highlights
 DEVICE_POINTS = 1250  # per view
 DEVICE_MARGIN = 0.9  # of the disagreement may be left for a correction of the device to be taken
 

@@ -29,17 +29,19 @@ def disagreement(value: Tensor, valid: Tensor, points: Observations, scale: floa
     return torch.where(count >= MIN_CHECKED, mean, torch.nan)
 
 
-def improved(old: Tensor, new: Tensor, valid: Tensor, points: Observations, cell: Tensor, scale: float) -> Tensor:
+def improved(
+    old: Tensor, new: Tensor, valid: Tensor, points: Observations, cell: Tensor, scale: float, errors: float = SURE
+) -> Tensor:
     """[V] bool: whether each view agrees better with the others' new values by its own new ones than by its old.
 
     old, new: [V,K,C]; valid: [V,K], where both mean something. cell: [P] int64, the cell of each of the points. False
-    where nothing can be said, and where the cells differ so much that it may be chance.
+    where nothing can be said, and where the mean gain is not above 0 by `errors` standard errors of the cells' gains.
     """
     rest, others = _others(new, valid, points, scale)
     before, after = _distance(old, rest, scale), _distance(new, rest, scale)
     mean_before, count = _mean(before, others)
     mean_after, _ = _mean(after, others)
-    sure = _significant((before - after) * others, others, cell[points.point], SURE)
+    sure = _significant((before - after) * others, others, cell[points.point], errors)
     return sure & (count >= MIN_CHECKED) & (mean_after < MARGIN * mean_before)
 
 

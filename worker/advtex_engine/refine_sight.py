@@ -26,6 +26,7 @@ CHECKED_SHARE = 0.2  # of the surface is set aside to judge the result
 CHECKED_PER_VIEW = 1500
 SPREAD_STRIDE = 16  # every so many of the points hold the content in place
 MIN_CANDIDATES = 1000  # points of the drawn ones that two views must see, to refine anything
+CONTRAST_SCALE = 0.5  # disagreements of `features` beyond twice that are occlusions or highlights
 LUMINANCE = (0.299, 0.587, 0.114)
 
 

@@ -33,6 +33,7 @@ def _headers(**described: str) -> dict[str, dict[str, object]]:
     }
 
 
+TEXTURE = {"operationId": "create_job_v1_jobs_post", "requestBody": {"upload_id": "$response.body#/id"}}
 OFFSET = _headers(Upload_Offset="bytes that are durable", Upload_Expires="when an unfinished upload is forgotten")
 
 
@@ -55,7 +56,7 @@ async def upload_features(service: TheService) -> Response:
     openapi_extra={
         "requestBody": {"required": False, "content": {"application/zip": BINARY, tus.OFFSET_STREAM: BINARY}}
     },
-    responses={201: {"headers": _headers(Location="the upload") | OFFSET}},
+    responses={201: {"headers": _headers(Location="the upload") | OFFSET, "links": {"texture": TEXTURE}}},
 )
 async def create_upload(
     request: Request,

@@ -72,7 +72,7 @@ def optimize(
         maps,
         planar_pairs(len(color), device, auxiliary=auxiliary),
         texture.to(device)[maps.slot_map >= 0],
-        PRESETS["full"],
+        PRESETS["paper"],
         kind="scene",
         steps=steps,
         generator=torch.Generator(device).manual_seed(seed),

@@ -76,7 +76,7 @@ def task(
 ) -> MethodInput:
     maps = build_view_maps(atlas, views, "scene")
     listener = monitor or Monitor()
-    preset = replace(PRESETS["full"], levels=(PyramidLevel(3),))
+    preset = replace(PRESETS["paper"], levels=(PyramidLevel(3),), start="mean")
     return MethodInput(
         Scene(atlas.mesh, views),
         atlas,
@@ -242,7 +242,7 @@ def small_optimizer(around: MethodInput, **ablation: bool) -> AdversarialOptimiz
         maps,
         own_pairs(maps),
         around.means[1][maps.slot_map >= 0],
-        replace(PRESETS["full"], **ablation),  # type: ignore[arg-type]  # flags of the ablations
+        replace(PRESETS["paper"], **ablation),  # type: ignore[arg-type]  # flags of the ablations
         kind="scene",
         steps=4,
         generator=torch.Generator().manual_seed(0),

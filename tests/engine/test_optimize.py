@@ -16,7 +16,7 @@ from advtex_engine.planar import planar_views
 from advtex_engine.texture import bilinear_footprint, decode_uv
 
 WIDTH, HEIGHT = 96, 72
-PRESET = dataclasses.replace(PRESETS["full"], l1_decays=4)
+PRESET = dataclasses.replace(PRESETS["paper"], l1_decays=4)
 
 
 def optimizer(seed: int = 0, steps: int = 20, preset: Preset = PRESET) -> AdversarialOptimizer:

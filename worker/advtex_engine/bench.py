@@ -137,7 +137,7 @@ def _optimizer(kind: type[AdversarialOptimizer], maps: ViewMaps, pairs: Pairs, d
     discriminator = PatchDiscriminator(torch.Generator().manual_seed(0)).to(device)
     generator = torch.Generator(device).manual_seed(0)
     start = torch.zeros((maps.slots, 3), device=device)
-    preset = PRESETS["full"]
+    preset = PRESETS["paper"]
     return kind(
         maps, pairs, start, preset, kind="scene", steps=preset.steps, generator=generator, discriminator=discriminator
     )

@@ -19,24 +19,24 @@ _bearer = HTTPBearer(auto_error=False, description="`adv_<id>_<secret>`", scheme
 _Key = Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
 
 
-def _service(request: Request) -> Service:
+async def _service(request: Request) -> Service:
     return cast(Service, request.app.state.service)
 
 
-def _intake(request: Request) -> Intake:
+async def _intake(request: Request) -> Intake:
     return cast(Intake, request.app.state.intake)
 
 
-def _webhooks(request: Request) -> WebhookService:
+async def _webhooks(request: Request) -> WebhookService:
     return cast(WebhookService, request.app.state.webhooks)
 
 
-def reader(request: Request, _key: _Key) -> Caller:
+async def reader(request: Request, _key: _Key) -> Caller:
     """The caller, who may look."""
     return _with_scope(request, "read")
 
 
-def writer(request: Request, _key: _Key) -> Caller:
+async def writer(request: Request, _key: _Key) -> Caller:
     """The caller, who may change things."""
     return _with_scope(request, "write")
 

@@ -24,8 +24,8 @@ class Check:
 
 
 def checks(store: Store, settings: ServerSettings) -> list[Check]:
-    """Look at database, blobs, disk and queue."""
-    return [_database(store), _blobs(store), _disk(store, settings), _redis(store)]
+    """Look at database, blobs, disk, queue and workers."""
+    return [_database(store), _blobs(store), _disk(store, settings), _redis(store), _workers(store)]
 
 
 def _database(store: Store) -> Check:
@@ -62,6 +62,16 @@ def _redis(store: Store) -> Check:
     except (RedisError, OSError) as error:
         return Check("redis", False, False, f"Redis does not answer, jobs are accepted and wait: {_first_line(error)}")
     return Check("redis", True, False)
+
+
+def _workers(store: Store) -> Check:
+    try:
+        living = store.queue.workers()
+    except (RedisError, OSError):
+        return Check("workers", False, False, "not known while Redis does not answer")
+    if not living:
+        return Check("workers", False, False, "no worker is running, jobs are accepted and wait: start advtex-worker")
+    return Check("workers", True, False, f"{len(living)} running")
 
 
 def _first_line(error: Exception) -> str:

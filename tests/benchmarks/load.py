@@ -1,7 +1,7 @@
 """How the API answers under load: `python tests/benchmarks/load.py`. One server process, SQLite, everything on this
 machine, the load's own cost included.
 
-200 clients ask for a job that is running, each once a second, 20 listen to its events, and 4 upload without pause;
+200 clients ask for a running job, each once a second, 20 listen to its events, and 4 upload 4 MB per second each;
 afterwards 10,000 finished jobs are listed page by page. Prints one JSON object.
 """
 
@@ -19,6 +19,8 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+import psutil
+
 from advtex_contract.jobs import JobSpec, JobState, Progress
 from advtex_server.settings import ServerSettings
 from advtex_store.database import upgrade_database
@@ -29,7 +31,8 @@ from advtex_store.store import Store, open_store
 POLLERS = 200
 STREAMS = 20
 UPLOADS = 4
-UPLOAD_BYTES = 16 << 20
+UPLOAD_BYTES = 16_000_000
+UPLOAD_SECONDS = 4.0
 SECONDS = 20.0
 FINISHED = 10_000
 PAGE = 50
@@ -48,11 +51,16 @@ class Line:
     def close(self) -> None:
         self._writer.close()
 
-    async def request(self, method: str, path: str, body: bytes = b"") -> bytes:
-        """-> the body of a 2xx answer."""
+    async def request(self, method: str, path: str, body: bytes = b"", pieces: int = 1) -> bytes:
+        """-> the body of a 2xx answer. A body in pieces is sent over `UPLOAD_SECONDS`."""
         length = f"Content-Length: {len(body)}\r\n" if body else ""
-        self._writer.write(f"{method} {path} HTTP/1.1\r\n{self._headers}{length}\r\n".encode() + body)
-        await self._writer.drain()
+        self._writer.write(f"{method} {path} HTTP/1.1\r\n{self._headers}{length}\r\n".encode())
+        step = len(body) // pieces
+        for start in range(0, len(body), max(1, step)):
+            self._writer.write(body[start : start + step])
+            await self._writer.drain()
+            if pieces > 1:
+                await asyncio.sleep(UPLOAD_SECONDS / pieces)
         head = await self._reader.readuntil(b"\r\n\r\n")
         size = int(head.lower().partition(b"content-length:")[2].split(b"\r\n")[0])
         answer = await self._reader.readexactly(size)
@@ -78,8 +86,10 @@ async def poll(line: Line, path: str, until: float, start: float, times: list[fl
 async def upload(line: Line, until: float, sizes: list[int]) -> None:
     body = os.urandom(UPLOAD_BYTES)
     while time.perf_counter() < until:
-        await line.request("POST", "/v1/uploads", body)
+        began = time.perf_counter()
+        await line.request("POST", "/v1/uploads", body, pieces=100)
         sizes.append(UPLOAD_BYTES)
+        await asyncio.sleep(max(0.0, UPLOAD_SECONDS - (time.perf_counter() - began)))
 
 
 async def page_through(line: Line, times: list[float]) -> int:
@@ -94,7 +104,7 @@ async def page_through(line: Line, times: list[float]) -> int:
         cursor = f"&cursor={page['next_cursor']}"
 
 
-async def measure(port: int, key: str, job: str) -> dict[str, object]:
+async def measure(port: int, key: str, job: str, server: psutil.Process) -> dict[str, object]:
     lines = [Line(port, key) for _ in range(POLLERS + STREAMS + UPLOADS + 1)]
     for line in lines:
         await line.open()
@@ -102,10 +112,12 @@ async def measure(port: int, key: str, job: str) -> dict[str, object]:
     sizes: list[int] = []
     listing: list[float] = []
     path = f"/v1/jobs/{job}"
+    spent = sum(server.cpu_times()[:2])
     until = time.perf_counter() + SECONDS
     listeners = [asyncio.create_task(line.listen(f"{path}/events")) for line in lines[POLLERS : POLLERS + STREAMS]]
     pollers = [poll(line, path, until, n / POLLERS, asking) for n, line in enumerate(lines[:POLLERS])]
     await asyncio.gather(*pollers, *(upload(line, until, sizes) for line in lines[POLLERS + STREAMS : -1]))
+    spent = sum(server.cpu_times()[:2]) - spent
     for task in listeners:
         task.cancel()
         with suppress(asyncio.CancelledError):
@@ -119,6 +131,7 @@ async def measure(port: int, key: str, job: str) -> dict[str, object]:
         "list_jobs": summary(listing),
         "requests_per_second": round(len(asking) / SECONDS, 1),
         "uploaded_mb_per_second": round(sum(sizes) / SECONDS / 1e6, 1),
+        "server_cpu_share": round(spent / SECONDS, 2),
         "load_average": os.getloadavg()[0],
     }
 
@@ -188,7 +201,7 @@ def main() -> None:
         try:
             assert server.stdout is not None
             port = int(json.loads(server.stdout.readline())["url"].rpartition(":")[2])
-            print(json.dumps(asyncio.run(measure(port, key, job)), indent=1))
+            print(json.dumps(asyncio.run(measure(port, key, job, psutil.Process(server.pid))), indent=1))
         finally:
             done.set()
             heart.join()

@@ -148,20 +148,20 @@ def test_lambda_falls_in_equal_periods_over_the_run() -> None:
     assert weights == pytest.approx([10 * 0.8 ** (index // 5) for index in range(20)])
 
 
-def test_the_learning_rate_falls_in_a_straight_line_and_the_texture_follows_it() -> None:
+def test_the_learning_rates_fall_in_a_straight_line_and_both_players_follow_them() -> None:
     of = optimizer(steps=20)
-    of.preset = dataclasses.replace(PRESET, lr_texture_end=0.1)
+    of.preset = dataclasses.replace(PRESET, lr_end=0.1)
     rates = []
     for index in (0, 10, 20):
         of.index = index
-        rates.append(of.lr_texture)
-    assert rates == pytest.approx([1e-3, 0.55e-3, 0.1e-3])
+        rates.append(of.lr_share)
+    assert rates == pytest.approx([1.0, 0.55, 0.1])
     # Adam's first step is the learning rate itself, wherever there is a gradient.
-    before = of.values.detach().clone()
+    values, weights = of.values.detach().clone(), of.parameters[0].detach().clone()
     of.index = 10
     of.step()
-    moved = (of.values.detach() - before).abs()
-    assert moved.max().item() == pytest.approx(0.55e-3, rel=0.02)
+    assert (of.values.detach() - values).abs().max().item() == pytest.approx(0.55e-3, rel=0.02)
+    assert (of.parameters[0].detach() - weights).abs().max().item() == pytest.approx(0.55e-4, rel=0.02)
 
 
 def test_losses_are_means_since_the_last_call() -> None:
@@ -205,7 +205,7 @@ def test_pretraining_moves_the_discriminator_alone() -> None:
         of.step()
     assert torch.equal(of.values, start)
     assert not torch.equal(of.parameters[0], weights)
-    assert of.lr_texture == PRESET.lr_texture
+    assert of.lr_share == 1.0
     of.step()
     assert not torch.equal(of.values, start)
 

@@ -28,8 +28,8 @@ class Preset:
     start             "zero" (paper), "mean" (the projected mean) or "selection" (one view per face)
     pretraining       first steps, counted in `levels`, in which the discriminator learns alone
     lr_texture        1e-3, Adam; colors in [0, 1]
-    lr_texture_end    share of lr_texture at the last step, reached in a straight line (paper: 1, no decay)
     lr_discriminator  1e-4, Adam
+    lr_end            share of both at the last step, reached in a straight line (paper: 1, no decay)
     beta1             0.5
     l1_weight         lambda = 10 at the start
     l1_target         "auxiliary" (paper: the warped auxiliary image) or "start" (the start's own render)
@@ -49,8 +49,8 @@ class Preset:
     start: Literal["zero", "mean", "selection"]
     pretraining: int = 0
     lr_texture: float = 1e-3
-    lr_texture_end: float = 1.0
     lr_discriminator: float = 1e-4
+    lr_end: float = 1.0
     beta1: float = 0.5
     l1_weight: float = 10.0
     l1_target: Literal["auxiliary", "start"] = "auxiliary"
@@ -77,14 +77,14 @@ STANDARD = Preset(
     levels=(PyramidLevel(4_000),),
     start="selection",
     pretraining=400,
-    lr_texture=4e-4,
-    lr_texture_end=0.05,
-    lr_discriminator=2e-4,
+    lr_texture=2e-4,
+    lr_discriminator=1e-4,
+    lr_end=0.05,
     l1_weight=1.0,
     l1_target="start",
     l1_decays=0,
     feature_weight=10.0,
-    averaging=600,
+    averaging=1_000,
     alignment=True,
     max_crop=(384, 288),
 )
@@ -93,9 +93,11 @@ PRESETS: dict[str, Preset] = {
     "full": replace(
         STANDARD,
         levels=(PyramidLevel(50_000),),
-        pretraining=2_000,
-        lr_texture=2e-4,
-        averaging=5_000,
+        # The same way in smaller steps: a discriminator that has gone further than standard's spoils the texture.
+        pretraining=5_000,
+        lr_texture=2e-5,
+        lr_discriminator=1e-5,
+        averaging=12_000,
         max_crop=None,
     ),
     "standard": STANDARD,

@@ -110,10 +110,10 @@ class AdversarialOptimizer:
         return self.index < self.preset.pretraining
 
     @property
-    def lr_texture(self) -> float:
-        """The texture's learning rate at this step: from lr_texture in a straight line to lr_texture_end of it."""
+    def lr_share(self) -> float:
+        """Of both learning rates at this step: 1 while the discriminator learns alone, then straight to lr_end."""
         done = max(0.0, (self.index - self.preset.pretraining) / (self.steps - self.preset.pretraining))
-        return self.preset.lr_texture * (1 - (1 - self.preset.lr_texture_end) * done)
+        return 1 - (1 - self.preset.lr_end) * done
 
     def draw(self) -> Batch:
         """A random pair and crop, with the auxiliary view warped into the source."""
@@ -177,7 +177,7 @@ class AdversarialOptimizer:
     def update_texture(self, gradient: Tensor) -> None:
         """One step of Adam over the compact texture."""
         self.values.grad = gradient
-        self.adam_texture.param_groups[0]["lr"] = self.lr_texture
+        self.adam_texture.param_groups[0]["lr"] = self.preset.lr_texture * self.lr_share
         self.adam_texture.step()
 
     @property
@@ -202,6 +202,7 @@ class AdversarialOptimizer:
             parameter.grad = gradient.contiguous()
         if self.device.type != "cpu":
             self.adam_discriminator.found_inf = losses.ahead  # type: ignore[attr-defined]  # the fused kernel's skip flag
+        self.adam_discriminator.param_groups[0]["lr"] = self.preset.lr_discriminator * self.lr_share
         self.adam_discriminator.step()
 
     def drain_losses(self) -> dict[str, float]:

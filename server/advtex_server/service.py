@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from urllib.parse import quote
 
 import structlog
+from sqlalchemy.exc import SQLAlchemyError
 
 from advtex_contract.errors import ErrorCode, ErrorDetail
 from advtex_contract.jobs import (
@@ -31,13 +33,13 @@ from advtex_server.settings import ServerSettings
 from advtex_store import keys
 from advtex_store.accounts import Caller
 from advtex_store.blobs import FolderBlobs
-from advtex_store.errors import BlobNotFound, ReferenceRefused
+from advtex_store.errors import BlobNotFound, ReferenceRefused, StoreError
 from advtex_store.models import JobRow
 from advtex_store.needs import needed_memory
 from advtex_store.records import WAITING
 from advtex_store.results import StoredFile
 from advtex_store.store import Store
-from advtex_store.submissions import JobFilter, Reservation
+from advtex_store.submissions import HOLD_SECONDS, JobFilter, Reservation
 
 IN_LINE = "a worker takes it when its turn comes"
 
@@ -76,7 +78,8 @@ class Service:
                 return job_view(held), False
             reservation = held
         try:
-            row = self._checked_job(caller, spec, reservation)
+            with self._holding(reservation):
+                row = self._checked_job(caller, spec, reservation)
         except BaseException:
             if reservation is not None:
                 self.store.submissions.release(reservation)
@@ -118,6 +121,27 @@ class Service:
         raise ApiError(ErrorCode.not_found, f"job {job_id} has no result {name!r}")
 
     # -- inside ---------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _holding(self, reservation: Reservation | None) -> Iterator[None]:
+        """The check of a large scan takes longer than a reservation lasts: a thread renews it meanwhile."""
+        if reservation is None:
+            yield
+            return
+        done = threading.Event()
+
+        def renew() -> None:
+            while not done.wait(HOLD_SECONDS / 3):
+                with suppress(SQLAlchemyError, StoreError):
+                    self.store.submissions.renew(reservation)
+
+        thread = threading.Thread(target=renew, name="reservation", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()
 
     def _checked_job(self, caller: Caller, spec: JobSpec, reservation: Reservation | None) -> JobRow:
         owner = caller.owner

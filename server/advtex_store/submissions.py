@@ -1,7 +1,8 @@
 """New jobs, lists of them, and idempotency keys.
 
 A request with an idempotency key first reserves it, then checks the scan, then creates the job and binds the key to it
-in one transaction. A reservation whose request died is taken over after `HOLD_SECONDS`.
+in one transaction. The request renews its reservation while it works; one whose server died is taken over after
+`HOLD_SECONDS`, which is as long as a client that tries again has to wait.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from advtex_store.models import EventRow, IdempotencyRow, JobRow, UploadRow
 from advtex_store.tallies import tally_end
 from advtex_store.webhooks import tell_webhooks
 
-HOLD_SECONDS = 300.0
+HOLD_SECONDS = 15.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +81,16 @@ class Submissions:
                 raise IdempotencyInFlight(f"a request with the idempotency key {token!r} is still being answered")
             row.holder, row.held_until = holder, now + HOLD_SECONDS
             return Reservation(owner, token, holder)
+
+    def renew(self, reservation: Reservation) -> None:
+        """The request is still working; does nothing for a reservation that another request took over."""
+        with self.database.write() as session:
+            session.execute(
+                update(IdempotencyRow)
+                .where(IdempotencyRow.owner == reservation.owner, IdempotencyRow.token == reservation.token)
+                .where(IdempotencyRow.holder == reservation.holder)
+                .values(held_until=self.database.now(session) + HOLD_SECONDS)
+            )
 
     def release(self, reservation: Reservation) -> None:
         """The request made no job: the key is free again."""

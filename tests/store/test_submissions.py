@@ -100,6 +100,19 @@ def test_a_dead_request_gives_its_key_away_and_makes_no_second_job(bench: Any) -
     assert [row.id for row in bench.submissions.list_jobs(bench.owner)[0]] == [job.id]
 
 
+def test_a_request_that_still_works_keeps_its_key(bench: Any) -> None:
+    spec = JobSpec(upload_id=bench.finished_upload())
+    slow = bench.submissions.reserve(bench.owner, "key", "body")
+    for _ in range(3):
+        bench.clock.now += HOLD_SECONDS - 1
+        bench.submissions.renew(slow)
+    with pytest.raises(IdempotencyInFlight):
+        bench.submissions.reserve(bench.owner, "key", "body")
+    job = bench.submissions.create_job(bench.owner, spec, reservation=slow)
+    bench.submissions.renew(slow)
+    assert bench.submissions.reserve(bench.owner, "key", "body").id == job.id
+
+
 def test_many_requests_at_once_make_one_job(bench: Any) -> None:
     spec = JobSpec(upload_id=bench.finished_upload())
     barrier = threading.Barrier(8)

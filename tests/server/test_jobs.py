@@ -15,6 +15,11 @@ from advtex_contract.jobs import JobError, JobPage, JobView, Progress
 from advtex_store.errors import StaleAttempt
 
 
+def lasting(view: dict[str, Any]) -> dict[str, Any]:
+    """A job's view without what the dispatcher may change at any time: why the job waits."""
+    return {name: value for name, value in view.items() if name not in ("waiting_reason", "updated_at")}
+
+
 def test_a_good_scan_is_queued(live: Any, scan_zip: Path) -> None:
     response = live.http.post(
         "/v1/jobs",
@@ -24,7 +29,7 @@ def test_a_good_scan_is_queued(live: Any, scan_zip: Path) -> None:
     job = JobView.model_validate_json(response.content)
     assert response.headers["location"] == f"/v1/jobs/{job.id}"
     assert (job.state, job.attempt, job.label, job.options.preset) == ("queued", 0, "chair", "preview")
-    assert JobView.model_validate_json(live.http.get(f"/v1/jobs/{job.id}").content) == job
+    assert lasting(live.http.get(f"/v1/jobs/{job.id}").json()) == lasting(response.json())
 
 
 def test_a_bad_scan_is_rejected_with_every_finding(live: Any, is_error: Any) -> None:
@@ -85,7 +90,7 @@ def test_a_key_in_flight_is_a_conflict(
     first.join()
     is_error(response, 409, "idempotency_in_flight")
     assert response.headers["retry-after"] == "1"
-    assert live.http.get("/v1/jobs").json()["jobs"] == jobs
+    assert [lasting(job) for job in live.http.get("/v1/jobs").json()["jobs"]] == [lasting(job) for job in jobs]
 
 
 def test_a_refused_request_frees_its_key(live: Any, scan_zip: Path, is_error: Any) -> None:

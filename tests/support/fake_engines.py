@@ -6,6 +6,7 @@ They run in the runner's process, which finds them through PYTHONPATH.
 from __future__ import annotations
 
 import ctypes
+import errno
 import hashlib
 import json
 import os
@@ -125,6 +126,15 @@ def exits(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: b
 
 def raises(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
     raise ValueError("the widget is not a gadget")
+
+
+def finds_the_disk_full(
+    scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor
+) -> None:
+    """Once; the next call finishes if it is to go on from the work folder."""
+    if not resume:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    quick(scan, out, config, work=work, resume=resume, monitor=monitor)
 
 
 def out_of_memory(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:

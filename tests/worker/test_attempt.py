@@ -105,6 +105,13 @@ def test_an_error_that_would_come_again_fails_the_job(
     assert ("Traceback" in row.error["log_tail"]) == (code != "invalid_options")
 
 
+def test_a_full_disk_pauses_the_attempt_and_costs_nothing(store: Store, host: Hosts, new_job: NewJob) -> None:
+    job_id = new_job()
+    run_attempt(host("finds_the_disk_full"), job_id, 1)
+    row = store.records.job(job_id)
+    assert (row.state, row.attempt) == (JobState.succeeded, 1)
+
+
 def test_a_bad_scan_is_rejected_with_every_problem(store: Store, host: Hosts, new_job: NewJob) -> None:
     job_id = new_job()
     run_attempt(host("rejects"), job_id, 1)

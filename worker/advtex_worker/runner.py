@@ -6,6 +6,7 @@ parent. Nothing here knows the queue, the rows or the blobs.
 
 from __future__ import annotations
 
+import errno
 import importlib
 import math
 import os
@@ -37,6 +38,7 @@ from advtex_worker.events import (
 from advtex_worker.parentage import die_with_parent
 
 ENGINE = "advtex_engine.pipeline:texture_scan"
+DISK_SECONDS = 2.0  # between two looks whether a full disk has room again
 
 
 class Reporter(Monitor):
@@ -80,9 +82,22 @@ class Reporter(Monitor):
     def stop_requested(self) -> bool:
         return self._stop.is_set()
 
+    def wait_for_stop(self, seconds: float) -> bool:
+        return self._stop.wait(seconds)
+
 
 def run(request: Request, reporter: Reporter) -> Ending:
-    """Run the engine and say how it ended. What is not the engine's own error is logged with its traceback."""
+    """Run the engine and say how it ended. A full disk is no end: the engine goes on from its checkpoint later."""
+    while (ending := _run_once(request, reporter)) is None:
+        print(f"the disk is full: waiting {DISK_SECONDS:.0f} s", file=sys.stderr, flush=True)
+        if reporter.wait_for_stop(DISK_SECONDS):
+            return StoppedEvent()
+        request = request.model_copy(update={"resume": True})
+    return ending
+
+
+def _run_once(request: Request, reporter: Reporter) -> Ending | None:
+    """None for a full disk. What is not the engine's own error is logged with its traceback."""
     try:
         texture_scan = _resolved(request.engine)
         texture_config(request.options, "cpu")  # options are refused before a device is waited for
@@ -107,6 +122,8 @@ def run(request: Request, reporter: Reporter) -> Ending:
         return FailedEvent(code="engine_error", message=str(error))
     except Exception as error:
         traceback.print_exc()
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return None
         if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":  # torch's own class
             remedy = "choose a smaller --size or --max-texture-size, or a machine with more memory"
             return FailedEvent(code="out_of_memory", message=f"the engine ran out of memory: {error}; {remedy}")

@@ -82,8 +82,8 @@ def submit_batch(
 
 
 def result_rows(client: Client, batch_id: str) -> Iterator[dict[str, Any]]:
-    """A batch's jobs, oldest first, for a table: what each came to, and its scores where frames were held out."""
-    for job in reversed(list(client.list_jobs(batch=batch_id))):
+    """A batch's jobs, sorted by label, for a table: what each came to, and its scores where frames were held out."""
+    for job in sorted(client.list_jobs(batch=batch_id), key=lambda job: (job.label, job.id)):
         row: dict[str, Any] = {"job": job.id, "label": job.label, "state": job.state.value, "steps": job.progress.steps}
         row["seconds"] = round(sum(job.progress.stage_seconds.values()), 1)
         if job.error is not None:

@@ -18,6 +18,17 @@ router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 JobId = Annotated[str, Path(max_length=64)]
 
 
+EVENT = {  # before OpenAPI 3.2 a stream's schema is that of each event
+    "type": "object",
+    "required": ["id", "event", "data"],
+    "properties": {
+        "id": {"type": "string", "pattern": "^[0-9]+$"},
+        "event": {"type": "string", "enum": ["state", "progress", "job"]},
+        "data": {"type": "string", "contentMediaType": "application/json"},
+    },
+}
+
+
 @router.post("", status_code=201, responses={200: {"model": JobView, "description": "the key's job, made before"}})
 def create_job(
     spec: JobSpec,
@@ -76,7 +87,7 @@ def delete_job(job_id: JobId, caller: Writer, service: TheService) -> Response:
 @router.get(
     "/{job_id}/events",
     response_class=StreamingResponse,
-    responses={200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}}},
+    responses={200: {"content": {"text/event-stream": {"schema": EVENT}}}},
 )
 def job_events(
     job_id: JobId,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import time
 from pathlib import Path
 
@@ -54,6 +55,20 @@ def test_a_write_that_fails_leaves_the_file_before_it(tmp_path: Path) -> None:
     assert loaded is not None
     assert loaded["a"] == 1
     assert [path.name for path in tmp_path.iterdir()] == ["stage.pt"]
+
+
+@pytest.mark.parametrize("parts", [1, 3, 200])
+def test_a_file_that_cannot_grow_is_an_os_error(tmp_path: Path, parts: int) -> None:
+    """Who waits for room on a full disk must be able to tell it from a fault."""
+    folder = WorkFolder(tmp_path, "run", Monitor())
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, limits[1]))
+    try:
+        with pytest.raises(OSError, match="too large"):
+            folder.save("stage", {str(part): torch.zeros(300_000 // parts) for part in range(parts)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_clear_removes_what_an_earlier_run_left(tmp_path: Path) -> None:

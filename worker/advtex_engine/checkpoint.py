@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 import torch
 
@@ -23,7 +23,8 @@ MAX_SHARE = 0.01  # of the run time goes into checkpoints; the promise is 2 %
 class WorkFolder:
     """Named dictionaries of tensors and plain values below `path`, tied to `fingerprint`.
 
-    save: atomic and durable, then reported to the monitor. load: None when absent, unreadable or of another run.
+    save: atomic and durable, then reported to the monitor; OSError when the disk is full. load: None when absent,
+    unreadable or of another run.
     seconds: spent in `save` so far.
     """
 
@@ -36,7 +37,11 @@ class WorkFolder:
         started = time.monotonic()
         target = self.path / f"{name}.pt"
         with atomic_file(target) as file:
-            torch.save({"fingerprint": self.fingerprint, **content}, file)
+            watched = _Watched(file)
+            try:
+                torch.save({"fingerprint": self.fingerprint, **content}, cast(BinaryIO, watched))
+            except RuntimeError as error:
+                raise watched.error or error from None
         self.monitor.checkpointed((target,))
         self.seconds += time.monotonic() - started
 
@@ -54,6 +59,24 @@ class WorkFolder:
         """Removes what an earlier run left."""
         for file in self.path.glob("*.pt"):
             file.unlink()
+
+
+class _Watched:
+    """A file that keeps the error of a failed write: torch raises a RuntimeError of its own, which does not tell it."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.file = file
+        self.error: OSError | None = None
+
+    def write(self, data: bytes) -> int:
+        try:
+            return self.file.write(data)
+        except OSError as error:
+            self.error = error
+            raise
+
+    def flush(self) -> None:
+        self.file.flush()
 
 
 class CheckpointTimer:

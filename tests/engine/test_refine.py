@@ -189,7 +189,7 @@ def test_held_out_views_and_everything_else_stay_as_they_are(refined: tuple[Scen
         assert new.color.dtype == torch.uint8
 
 
-def test_the_mean_motion_is_nil(refined: tuple[Scene, Refinement]) -> None:
+def test_the_mean_motion_is_small(refined: tuple[Scene, Refinement]) -> None:
     given, refinement = refined
     sight = look_at(given.mesh, given.views, given.kind, CPU, 0)
     assert sight is not None
@@ -203,9 +203,10 @@ def test_the_mean_motion_is_nil(refined: tuple[Scene, Refinement]) -> None:
         weight = (1 / z.square() / (1 / z.square()).sum())[:, None]
         shifts.append((weight * (moved - place)).sum(0))
         turns.append((weight * torch.linalg.cross(place, moved)).sum(0))
-    assert torch.stack(shifts).mean(0).norm() < 1e-9
-    assert torch.stack(turns).mean(0).norm() < 1e-9
+    for motions in (torch.stack(shifts), torch.stack(turns)):
+        assert motions.mean(0).norm() < 0.15 * motions.norm(dim=1).mean()
     assert torch.stack(shifts).norm(dim=1).min() > 1e-3  # metres
+    assert 0 < refinement.report["mean"]["common_pixels"] < 0.3 * refinement.report["mean"]["moved_pixels"]
 
 
 @pytest.mark.parametrize("seed", [9, 10])

@@ -3,8 +3,7 @@
 The poses of held-out views stay as they are, so the gauge is kept: content stays, on average over all that the cameras
 see, where the given cameras put it. Nothing is taken on trust: cells of the surface that were set aside say per view
 whether its new pose is better than the given one, which it gets back if not, and whether all of it is better than
-nothing. The mean motion is removed last, from all views alike, so that their agreement, which they were judged by,
-stays. The same goes for the exposures.
+nothing. The same goes for the exposures.
 
 Before that, intrinsics and the color camera's place on the device are corrected if they are grossly wrong: held-out
 frames, which the same device has taken, get that correction too. What is off by less stays as given, since the poses
@@ -88,7 +87,9 @@ def refine_cameras(scene: Scene, device: torch.device, seed: int) -> Refinement:
         {"name": view.name, **{key: _plain(values[row]) for key, values in columns.items()}}
         for row, view in enumerate(scene.views)
     ]
+    common_motion = motion(found, replace(sight, given=keep_gauge(found, sight.given, sight.fitted)))
     totals = {key: _plain(columns[key].double().nanmean()) for key in columns if columns[key].ndim == 1}
+    totals["common_pixels"] = _plain(common_motion[:, 2].nanmean() * scale[0])
     described |= {} if common is None else _describe(common, scene.views[0].camera)
     report = {"device": described, "mean": totals, "frames": frames}
     shared = (None, None) if common is None else (common.lens.cpu(), common.offset.cpu())
@@ -174,8 +175,6 @@ def _poses(sight: Sight) -> tuple[Tensor, dict[str, Tensor]]:
             break
         good &= approved
         found = torch.where(good[:, None, None], found, given)
-    if good.any():
-        found = keep_gauge(found, given, sight.fitted)
     after = look(sight.features, sight.K, found, checked, sight.size)
     values = before.value[..., None], after.value[..., None]
     old = disagreement(values[0], before.valid, checked, CONTRAST_SCALE)

@@ -88,7 +88,9 @@ def refine_poses(
 
     luminance: [V,h,w] float32 in [0,1]. K: [V,3,3] float64 for that size. points: those compared. spread: points all
     over the surface, whose content is to stay where it is on the average; the mean motion of all cameras is removed
-    after each level. Without, the first view alone moves, and the others hold the gauge.
+    after each level but the finest: the mesh does not move with the cameras, so that they agree best where the mesh
+    is, and what they have in common beyond the anchor's pull is what the photographs insist on. Without, the first
+    view alone moves, and the others hold the gauge.
     """
     size = (luminance.shape[2], luminance.shape[1])
     world_to_camera = given
@@ -113,7 +115,7 @@ def refine_poses(
             longest = step.norm(dim=1).clamp(min=1e-12)
             step = step * (LARGEST_STEP * scale / longest).clamp(max=1)[:, None]
             world_to_camera = exponential((step * unit).double()) @ world_to_camera
-        if spread is not None:
+        if spread is not None and scale > 1:
             world_to_camera = keep_gauge(world_to_camera, given, points)
     return world_to_camera
 

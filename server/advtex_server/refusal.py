@@ -29,8 +29,18 @@ STATUS: Mapping[ErrorCode, int] = {
 }
 
 
+REMEDIES: Mapping[ErrorCode, tuple[str, str]] = {
+    ErrorCode.idempotency_in_flight: ("Idempotency-Key", "repeat the same request in a second"),
+    ErrorCode.idempotency_mismatch: ("Idempotency-Key", "use a new key for another request"),
+    ErrorCode.quota_exceeded: ("the key's quota", "wait for jobs to end, delete uploads, or ask the operator for more"),
+    ErrorCode.insufficient_storage: ("the server's disk", "try again later; the operator has to make room"),
+    ErrorCode.unavailable: ("the server", "try again in a few seconds; GET /readyz says what does not work"),
+}
+"""Where, and what helps, for refusals that no single field or file is to blame for."""
+
+
 class ApiError(Exception):
-    """A refusal with its code; `status` only where it differs from the code's usual one."""
+    """A refusal with its code; `status` only where it differs from the code's usual one, `details` from REMEDIES."""
 
     def __init__(
         self,
@@ -42,6 +52,9 @@ class ApiError(Exception):
         headers: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(message)
+        if not details and code in REMEDIES:
+            where, remedy = REMEDIES[code]
+            details = [ErrorDetail(code=code, where=where, message=message, remedy=remedy)]
         self.body = ErrorBody(code=code, message=message, details=details or [])
         self.status = status or STATUS[code]
         self.headers = dict(headers or {})

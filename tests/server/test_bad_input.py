@@ -199,6 +199,25 @@ def test_a_wrong_key(live: Any, is_error: Any, capsys: pytest.CaptureFixture[str
     lives_on(live, capsys)
 
 
+def test_a_full_disk(make_live: Any, is_error: Any) -> None:
+    live = make_live(disk_reserve_bytes=1 << 60)
+    response = live.http.post("/v1/uploads", content=b"bytes")
+    is_error(response, 507, "insufficient_storage")
+    (detail,) = response.json()["details"]
+    assert "disk" in detail["where"]
+    assert "room" in detail["remedy"]
+
+
+def test_two_uploads_with_one_idempotency_key(live: Any, is_error: Any) -> None:
+    first, second = live.upload(), live.upload()
+    live.job(first, key="once")
+    response = live.http.post("/v1/jobs", json={"upload_id": second}, headers={"Idempotency-Key": "once"})
+    is_error(response, 422, "idempotency_mismatch")
+    (detail,) = response.json()["details"]
+    assert detail["where"] == "Idempotency-Key"
+    assert detail["remedy"]
+
+
 def test_after_all_of_it_the_same_server_takes_a_good_scan(
     live: Any, scan: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:

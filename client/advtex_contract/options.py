@@ -21,7 +21,7 @@ class Preset(StrEnum):
 PRESET_HELP: dict[Preset, str] = {
     Preset.auto: "full on a GPU, standard on a CPU",
     Preset.paper: "the paper as printed: zero start, 50,000 steps",
-    Preset.full: "projected-mean start, 50,000 steps; for GPUs",
+    Preset.full: "starts from the best photograph per face, 50,000 steps; for GPUs",
     Preset.standard: "starts from the best photograph per face, 4,000 steps; minutes on a CPU",
     Preset.preview: "a coarse-to-fine pyramid for a first look in about two minutes on a CPU",
 }

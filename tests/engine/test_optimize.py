@@ -80,6 +80,27 @@ def test_a_batch_is_what_its_crop_shows() -> None:
     assert visible.mean() > 0.9
 
 
+def test_a_virtual_camera_moves_its_image_by_a_bounded_shift() -> None:
+    """What the source shows at the middle, a virtual auxiliary camera shows up to a turn and a move away from there."""
+    pixels = 3.0
+    sampler = optimizer().sampler
+    sampler.perturbation = pixels
+    focal, distance = 200.0, 1.5
+    per_pixel, deep = torch.tensor(distance / focal), torch.tensor(distance)
+    relative = torch.eye(4)[:3]
+    middle = torch.tensor([0.0, 0.0, distance])
+    shifts = []
+    for _ in range(200):
+        virtual = sampler._virtual(relative, per_pixel, deep)
+        torch.testing.assert_close(virtual[:, :3] @ virtual[:, :3].T, torch.eye(3), atol=1e-3, rtol=0)
+        moved = virtual[:, :3] @ middle + virtual[:, 3]
+        shifts.append(focal * moved[:2] / moved[2])
+    found = torch.stack(shifts)
+    assert found.abs().max() < 2.1 * pixels
+    assert found.abs().mean() > 0.5 * pixels
+    assert found.mean(0).norm() < 0.2 * pixels
+
+
 def responses(network: PatchDiscriminator, condition: torch.Tensor, residual: torch.Tensor) -> list[torch.Tensor]:
     """Plain twin of the discriminator's features."""
     layers, x = [], torch.cat((condition, residual), 1)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from advtex_engine.reproject import reproject, unproject_pixels
@@ -32,14 +33,22 @@ class PairSampler:
     """Draws pairs and crops of fixed view maps.
 
     kind: "object" or "scene", for theta_z. crop: width and height in pixels. generator: on the maps' device; its state
-    is all that decides the draws to come.
+    is all that decides the draws to come. perturbation: pixels by which a turn and a move of the auxiliary camera
+    shift its image at most, each; from such virtual cameras few views give many examples (paper, supplement D).
     """
 
     def __init__(
-        self, maps: ViewMaps, pairs: Pairs, kind: str, crop: tuple[int, int], generator: torch.Generator
+        self,
+        maps: ViewMaps,
+        pairs: Pairs,
+        kind: str,
+        crop: tuple[int, int],
+        generator: torch.Generator,
+        perturbation: float = 0.0,
     ) -> None:
         assert crop[0] <= maps.width and crop[1] <= maps.height
         self.maps, self.pairs, self.crop, self.generator = maps, pairs, crop, generator
+        self.perturbation = perturbation
         self.device = maps.color.device
         self.tolerance = DEPTH_TOLERANCE[kind]
         rows, columns = torch.arange(crop[1], device=self.device), torch.arange(crop[0], device=self.device)
@@ -63,7 +72,11 @@ class PairSampler:
         depth = maps.depth.view(-1).index_select(0, flat).to(torch.float32)
         foreground = depth > 0
         points = unproject_pixels(self._window_xy + torch.stack((left, top)), depth, maps.intrinsics[source])
-        real, visible = reproject(points, self.pairs.relative[source, candidate], maps, auxiliary, self.tolerance)
+        relative = self.pairs.relative[source, candidate]
+        if self.perturbation:
+            distance = depth.sum() / foreground.sum().clamp(min=1)
+            relative = self._virtual(relative, distance / maps.intrinsics[auxiliary][0], distance)
+        real, visible = reproject(points, relative, maps, auxiliary, self.tolerance)
         visible = visible & foreground
         uv = decode_uv(maps.uv.view(-1, 2).index_select(0, flat))
         texels, weights = bilinear_footprint(uv * self._texture_size, maps.slot_map.shape[1], maps.slot_map.shape[0])
@@ -77,6 +90,14 @@ class PairSampler:
             slots=slots,
             weights=weights * visible[:, None],
         )
+
+    def _virtual(self, relative: Tensor, per_pixel: Tensor, distance: Tensor) -> Tensor:
+        """The pose [3,4] of a virtual camera near that of `relative`; per_pixel: metres of a pixel at `distance`."""
+        random = 2 * torch.rand(6, generator=self.generator, device=self.device) - 1
+        shift = random * (self.perturbation * per_pixel)
+        turned = torch.linalg.cross((shift[:3] / distance).expand(4, 3).mT, relative, dim=0)
+        virtual: Tensor = relative + turned + F.pad(shift[3:, None], (3, 0))
+        return virtual
 
     def image(self, rows: Tensor) -> Tensor:
         """Rows [h*w,C] as an image [1,C,h,w] (channels_last memory, no copy)."""

@@ -38,6 +38,8 @@ class Preset:
                       example (paper: 0); tolerant to shifts as they are, it averages less than L1 does
     averaging         steps over which the resulting texture is averaged (paper: none, the last state)
     alignment         both examples are moved onto the source image before they are judged (Zhao et al. 2022)
+    perturbation      of the view's width, by which virtual motions of the auxiliary camera shift its image at most
+                      (paper: 0; its supplement D proposes them for sparse views)
     max_crop          largest crop (width, height) in pixels; larger views are seen in parts, for cheaper steps
     max_pair_angle    largest angle between the optical axes of a pair, degrees (released code: 15)
     min_pair_overlap  least share of the source's foreground that the auxiliary view sees
@@ -59,6 +61,7 @@ class Preset:
     feature_weight: float = 0.0
     averaging: int = 0
     alignment: bool = False
+    perturbation: float = 0.0
     max_crop: tuple[int, int] | None = None
     max_pair_angle: float = 15.0
     min_pair_overlap: float = 0.3

@@ -94,7 +94,8 @@ class AdversarialOptimizer:
         self.bfloat16 = native_bfloat16(device)
         self.crop = crop_size(maps.width, maps.height, preset.max_crop)
         self.aligns = preset.alignment and min(self.crop) >= BLOCK
-        self.sampler = PairSampler(maps, pairs, kind, self.crop, generator)
+        perturbation = preset.perturbation * maps.width
+        self.sampler = PairSampler(maps, pairs, kind, self.crop, generator, perturbation)
         self._sums = torch.zeros(len(LOSS_NAMES), device=device)
         self._summed = 0
 

@@ -70,7 +70,7 @@ def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
 
 def adversarial_no_auxiliary(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     """Ablation: the real example is the source image itself, so nothing teaches the misalignments."""
-    return adversarial(replace(given, preset=replace(given.preset, auxiliary=False)))
+    return adversarial(replace(given, preset=replace(given.preset, auxiliary=False, perturbation=0.0)))
 
 
 def adversarial_no_condition(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:

@@ -15,7 +15,8 @@ from urllib.parse import SplitResult, urlsplit
 
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
-NAT64 = ipaddress.IPv6Network("64:ff9b::/96")  # its last 32 bits are an IPv4 address
+UNICAST = ipaddress.IPv6Network("2000::/3")  # what is given out; whatever else Python's `is_global` may say of the rest
+NAT64 = ipaddress.IPv6Network("64:ff9b::/96")  # its last 32 bits are an IPv4 address: what DNS64 makes of a public name
 
 
 class TargetRefused(Exception):
@@ -76,6 +77,8 @@ class TargetRules:
     def _is_allowed(self, address: Address) -> bool:
         if any(address.version == network.version and address in network for network in self.networks):
             return True
+        if address.version == 6 and address not in UNICAST and address not in NAT64:
+            return False
         return all(inner.is_global and not inner.is_multicast for inner in (address, *_embedded(address)))
 
 
@@ -84,7 +87,7 @@ def _embedded(address: Address) -> list[ipaddress.IPv4Address]:
     if address.version == 4:
         return []
     assert isinstance(address, ipaddress.IPv6Address)
-    found = [address.ipv4_mapped, address.sixtofour, *(address.teredo or ())]
+    found = [address.sixtofour, *(address.teredo or ())]
     if address in NAT64:
         found.append(ipaddress.IPv4Address(int(address) & 0xFFFFFFFF))
     return [inner for inner in found if inner is not None]

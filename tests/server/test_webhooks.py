@@ -250,7 +250,12 @@ TARGETS = {
     "unspecified, IPv6": "[::]",
     "loopback, mapped": "[::ffff:127.0.0.1]",
     "loopback, NAT64": "[64:ff9b::7f00:1]",
+    "loopback, NAT64 of its own network": "[64:ff9b:1::7f00:1]",
     "loopback, 6to4": "[2002:7f00:1::]",
+    "loopback, Teredo": "[2001:0:101:101::80ff:fffe]",
+    "Teredo of a public host": "[2001:0:101:101::fefe:fefe]",
+    "loopback, IPv4-compatible": "[::127.0.0.1]",
+    "loopback, translated": "[::ffff:0:7f00:1]",
     "cloud metadata": "169.254.169.254",
     "cloud metadata, mapped": "[::ffff:169.254.169.254]",
     "cloud metadata, IPv6": "[fd00:ec2::254]",
@@ -259,6 +264,8 @@ TARGETS = {
     "private 192.168/16": "192.168.1.1",
     "carrier-grade NAT": "100.64.0.1",
     "link-local, IPv6": "[fe80::1]",
+    "site-local, IPv6": "[fec0::1]",
+    "not given out, IPv6": "[4000::1]",
     "multicast": "224.0.0.1",
     "broadcast": "255.255.255.255",
     "documentation": "192.0.2.1",
@@ -316,8 +323,15 @@ def test_a_name_is_resolved_once_and_its_address_is_pinned(monkeypatch: pytest.M
         TargetRules().resolve("https://one-of-two.example/")
 
 
+@pytest.mark.parametrize("host", ["1.1.1.1", "[2606:4700:4700::1111]", "[64:ff9b::101:101]", "[2002:101:101::1]"])
+def test_public_addresses_are_allowed(host: str) -> None:
+    assert host in TargetRules().resolve(f"https://{host}/").url
+
+
 def test_what_the_operator_allows_is_allowed() -> None:
     rules = TargetRules(allow_http=True, networks=LOOPBACK)
     assert rules.resolve("http://127.0.0.1:8080/x").url == "http://127.0.0.1:8080/x"
     with pytest.raises(TargetRefused):
         rules.resolve("http://10.0.0.1/")
+    local = TargetRules(networks=[ip_network("fd00::/8")])
+    assert local.resolve("https://[fd00::1]/").url == "https://[fd00::1]:443/"

@@ -1,11 +1,11 @@
-"""Checks of single frames: image headers against each other and against the intrinsics."""
+"""Checks of single frames: image headers against each other and against the intrinsics, and the images' ends."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 from advtex_scan.errors import ScanFormatError
-from advtex_scan.images import ImageHeader, place, read_image_header
+from advtex_scan.images import ImageHeader, check_end, place, read_image_header
 from advtex_scan.layouts import ScanReader
 from advtex_scan.manifest import ByteRange, FrameEntry, Intrinsics
 
@@ -30,7 +30,9 @@ def _color_camera(reader: ScanReader, frame: FrameEntry) -> Intrinsics | None:
 
 def _header(reader: ScanReader, ref: str | ByteRange) -> ImageHeader | None:
     try:
-        return read_image_header(reader.archive, ref)
+        header = read_image_header(reader.archive, ref)
+        check_end(reader.archive, ref, header)
+        return header
     except ScanFormatError as error:
         reader.findings.extend(error.findings)
         return None

@@ -79,6 +79,14 @@ class ScanArchive(ABC):
             return self.read_range(ref.path, ref.offset, min(length, ref.length))
         return self.read_range(ref, 0, min(length, self.size(ref)))
 
+    def tail(self, ref: FileRef, length: int) -> bytes:
+        """The last `length` bytes of a file or byte range, fewer if it is shorter."""
+        if isinstance(ref, ByteRange):
+            length = min(length, ref.length)
+            return self.read_range(ref.path, ref.offset + ref.length - length, length)
+        length = min(length, self.size(ref))
+        return self.read_range(ref, self.size(ref) - length, length)
+
     def read_range(self, name: str, offset: int, length: int) -> bytes:
         """`length` bytes from `offset` of a file; reading ranges in rising order passes over the file once."""
         size = self.size(name)

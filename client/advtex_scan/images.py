@@ -1,4 +1,4 @@
-"""Sizes and bit depths of PNG and JPEG images, from their headers only."""
+"""Sizes and bit depths of PNG and JPEG images, from their headers, and whether their ends are there."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from advtex_scan.manifest import FileRef
 
 MAX_PIXELS = 64_000_000  # a 48-megapixel phone picture passes, a decompression bomb does not
 FIRST_BYTES = 4 << 10
+LAST_BYTES = 1 << 10  # an end marker is the last thing in most files
 MOST_BYTES = 1 << 20  # a JPEG's profile and thumbnail may stand before its size
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
@@ -48,6 +49,25 @@ def read_image_header(archive: ScanArchive, ref: FileRef) -> ImageHeader:
         message = f"claims {header.width}x{header.height} pixels; at most {MAX_PIXELS // 10**6} megapixels are accepted"
         raise ImageError(Finding("error", "image_too_large", place(ref), message, "scale the images down"))
     return header
+
+
+def check_end(archive: ScanArchive, ref: FileRef, header: ImageHeader) -> None:
+    """Raises ImageError if the image is cut off. Reads the tail, and the whole file only if the end is not there."""
+    if not has_end(archive.tail(ref, LAST_BYTES), header) and not has_end(archive.read(ref), header):
+        raise cut_off(place(ref))
+
+
+def has_end(data: bytes, header: ImageHeader) -> bool:
+    """Whether an image that ends with `data` is whole; decoders fill with gray what is missing, and say nothing."""
+    if header.format == "png":
+        return data.rfind(b"IEND") > data.rfind(b"IDAT")
+    return data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")  # end of image after the last start of scan
+
+
+def cut_off(where: str) -> ImageError:
+    """The error for an image without its end."""
+    remedy = "copy the file again in full, or leave the frame out"
+    return ImageError(Finding("error", "truncated_image", where, "is cut off: its end is missing", remedy))
 
 
 def parse_image_header(data: bytes, where: str) -> ImageHeader | None:

@@ -40,13 +40,13 @@ def depth_png(width: int = WIDTH, height: int = HEIGHT) -> bytes:
 
 
 def jpeg(width: int = WIDTH, height: int = HEIGHT, before: bytes = b"") -> bytes:
-    """The segments of a JPEG up to its scan; `before` is the payload of application segments ahead of the size."""
+    """The segments of a JPEG with an empty scan; `before` is the payload of application segments ahead of the size."""
     segments = b"\xff\xd8\xff\xe0" + struct.pack(">H", 16) + b"JFIF\0" + bytes(9)
     for start in range(0, len(before), 65533):
         piece = before[start : start + 65533]
         segments += b"\xff\xe2" + struct.pack(">H", len(piece) + 2) + piece
     frame = struct.pack(">BHHB", 8, height, width, 3) + bytes([1, 0x22, 0, 2, 0x11, 1, 3, 0x11, 1])
-    return segments + b"\xff\xc0" + struct.pack(">H", len(frame) + 2) + frame + b"\xff\xda"
+    return segments + b"\xff\xc0" + struct.pack(">H", len(frame) + 2) + frame + b"\xff\xda\xff\xd9"
 
 
 def ply(vertices: Any = CORNERS, faces: Any = TRIANGLES, order: str = "<", index: str = "int") -> bytes:

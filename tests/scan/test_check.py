@@ -93,6 +93,14 @@ def image_cut(maker, make):
     maker.files["color/2.png"] = make.png()[:20]
 
 
+def image_without_end(maker, make):
+    maker.files["color/2.png"] = make.png()[:-20]
+
+
+def depth_without_end(maker, make):
+    maker.files["depth/2.png"] = make.depth_png()[:-20]
+
+
 def image_huge(maker, make):
     maker.files["color/2.png"] = make.png(15000, 15000)
 
@@ -179,6 +187,8 @@ def looks_away(maker, make):
         (bad_intrinsics, {"bad_intrinsics": "scan.json: color_intrinsics"}),
         (image_is_none, {"not_an_image": "color/2.png"}),
         (image_cut, {"not_an_image": "color/2.png"}),
+        (image_without_end, {"truncated_image": "color/2.png"}),
+        (depth_without_end, {"truncated_image": "depth/2.png"}),
         (image_huge, {"image_too_large": "color/2.png"}),
         (image_of_other_shape, {"color_size": "color/2.png"}),
         (depth_of_other_size, {"depth_size": "depth/2.png"}),

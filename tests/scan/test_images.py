@@ -1,15 +1,19 @@
-"""Image headers."""
+"""Image headers and ends."""
 
 from __future__ import annotations
 
 import struct
+import zipfile
 import zlib
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
-from advtex_scan import ImageError, open_scan, read_image_header
+from advtex_scan import ByteRange, ImageError, open_scan, read_image_header
+from advtex_scan.images import LAST_BYTES, check_end
 
 
 def header(tmp_path, content: bytes):
@@ -80,3 +84,48 @@ def test_what_is_no_image_says_so(tmp_path, content, message):
         header(tmp_path, content)
     assert caught.value.findings[0].where == "image"
     assert caught.value.findings[0].remedy
+
+
+@pytest.fixture(scope="module")
+def whole() -> dict[str, bytes]:
+    pixels = np.random.default_rng(0).integers(0, 255, (24, 32, 3)).astype(np.uint8)
+    return {suffix: cv2.imencode(suffix, pixels)[1].tobytes() for suffix in (".png", ".jpg")}
+
+
+def check(archive, ref) -> None:
+    check_end(archive, ref, read_image_header(archive, ref))
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_an_image_cut_off_anywhere_is_found(tmp_path, whole, suffix, data):
+    content = whole[suffix]
+    missing = data.draw(st.integers(9 if suffix == ".png" else 1, len(content)))
+    (tmp_path / "image").write_bytes(content[:-missing])
+    with open_scan(tmp_path) as archive, pytest.raises(ImageError) as caught:
+        check(archive, "image")
+    assert caught.value.findings[0].where == "image"
+    assert caught.value.findings[0].remedy
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@pytest.mark.parametrize("more", [0, 100, LAST_BYTES + 100])
+@pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED], ids=["stored", "deflated"])
+def test_what_follows_the_end_of_an_image_does_no_harm(tmp_path, whole, suffix, more, method):
+    with zipfile.ZipFile(tmp_path / "scan.zip", "w", method) as file:
+        file.writestr("image", whole[suffix] + bytes(more))
+        file.writestr("cut", whole[suffix][:-20] + bytes(more))
+    with open_scan(tmp_path / "scan.zip") as archive:
+        check(archive, "image")
+        with pytest.raises(ImageError, match="cut: is cut off: its end is missing"):
+            check(archive, "cut")
+
+
+def test_the_end_of_a_range_is_looked_for_inside_of_it(tmp_path, whole):
+    content = whole[".jpg"]
+    (tmp_path / "stream").write_bytes(content * 2)
+    with open_scan(tmp_path) as archive:
+        check(archive, ByteRange("stream", len(content), len(content), "jpeg"))
+        with pytest.raises(ImageError, match=rf"stream \(byte {len(content)}\): is cut off"):
+            check(archive, ByteRange("stream", len(content), len(content) - 50, "jpeg"))

@@ -134,6 +134,8 @@ def cameras_look_away(scan: Any) -> None:
         (put("zeros.bin", lambda _: bytes(8 << 20)), "compression_ratio", "zeros.bin"),
         (put("color/2.png", lambda _: b"hello"), "not_an_image", "color/2.png"),
         (put("color/2.png", lambda make: make.png(15_000, 15_000)), "image_too_large", "color/2.png"),
+        (put("color/2.png", lambda make: make.png()[:-20]), "truncated_image", "color/2.png"),
+        (put("depth/2.png", lambda make: make.depth_png()[:-20]), "truncated_image", "depth/2.png"),
         (put("depth/2.png", lambda make: make.depth_png(16, 12)), "depth_size", "depth/2.png"),
         (nan_in_a_pose, "bad_pose", "scan.json: frames[1].camera_to_world"),
         (nan_in_all_poses, "too_few_frames", ""),

@@ -30,7 +30,7 @@ from advtex_engine.scene import Camera, Mesh, Scene, View
 from advtex_scan.archive import ScanArchive, open_scan
 from advtex_scan.check import read_scan
 from advtex_scan.errors import Finding, ScanFormatError
-from advtex_scan.images import MAX_PIXELS, parse_image_header, place
+from advtex_scan.images import MAX_PIXELS, cut_off, has_end, parse_image_header, place
 from advtex_scan.manifest import ByteRange, FileRef, FrameEntry, Intrinsics, Matrix4, ScanManifest
 
 MAX_IMAGE_BYTES = 256 << 20
@@ -224,8 +224,8 @@ def _imdecode(data: bytes, ref: FileRef, flags: int) -> npt.NDArray[Any]:
                 "scale the images down",
             )
         )
-    if not _is_complete(data, header.format):
-        raise ScanError(_broken(ref, "is cut off: its end is missing"))
+    if not has_end(data, header):
+        raise ScanError(*map(_problem, cut_off(place(ref)).findings))
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
@@ -233,13 +233,6 @@ def _imdecode(data: bytes, ref: FileRef, flags: int) -> npt.NDArray[Any]:
     if image is None:
         raise ScanError(_broken(ref, "cannot be decoded"))
     return image
-
-
-def _is_complete(data: bytes, format_: str) -> bool:
-    """Whether the end marker is there; OpenCV fills what a cut-off image lacks with grey and says nothing."""
-    if format_ == "png":
-        return data.rfind(b"IEND") > data.rfind(b"IDAT")
-    return data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")  # end of image after the last start of scan
 
 
 def _check_size(ref: FileRef, image: npt.NDArray[Any], intrinsics: Intrinsics) -> None:

@@ -225,6 +225,64 @@ def test_cam_second_line_stands_in_for_intrinsics(cam, make):
     np.testing.assert_allclose([frame.fx, frame.fy, frame.cx, frame.cy], [30, 31, 16, 12], atol=1e-4)
 
 
+CONFIG = b"""%YAML:1.0
+# cameras
+depth_fx: 15
+depth_fy: 15.5
+depth_cx: 7.5
+depth_cy: 5.5
+depth_width: 16
+depth_height: 12
+
+RGB_fx: 30 # pixels
+RGB_fy: 31
+RGB_cx: 15.5
+RGB_cy: 11.5
+RGB_width: 32
+RGB_height: 24
+
+Global_Iterations: 300
+"""
+
+
+@pytest.mark.parametrize("form", ["folder", "zip"])
+def test_cam_intrinsics_of_g2ltex(cam, make, form):
+    del cam.files["intrinsics.txt"]
+    cam.files |= {name: make.depth_png(16, 12) for name in cam.files if name.startswith("depth")}
+    cam.files["Config/config.yml"] = CONFIG
+    found = reading(getattr(cam, form)())
+    assert found.report.ok, found.report.format_text()
+    assert found.report.findings == ()
+    for frame in found.manifest.frames:
+        assert frame.color_intrinsics == EXPECTED
+        assert frame.depth_intrinsics == Intrinsics(15, 15.5, 8, 6, 16, 12)
+
+
+def test_cam_intrinsics_in_a_file_of_their_own_come_first(cam):
+    cam.files["Config/config.yml"] = CONFIG.replace(b"RGB_fx: 30", b"RGB_fx: 99")
+    found = reading(cam.folder())
+    assert found.manifest.frames[0].color_intrinsics == EXPECTED
+    assert [(finding.code, finding.where) for finding in found.report.findings] == [
+        ("ignored_file", "Config/config.yml")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "message"),
+    [
+        (b"RGB_fx: wide", "bad_numbers", "RGB_fx to RGB_height"),
+        (b"RGB_fx:", "bad_numbers", "RGB_fx to RGB_height"),
+        (b"RGB_fx: -30", "bad_intrinsics", "fx -30"),
+    ],
+)
+def test_bad_intrinsics_of_g2ltex_are_named(cam, line, code, message):
+    del cam.files["intrinsics.txt"]
+    cam.files["Config/config.yml"] = CONFIG.replace(b"RGB_fx: 30 # pixels", line)
+    errors = [finding for finding in reading(cam.folder()).report.findings if finding.severity == "error"]
+    assert [(error.code, error.where) for error in errors] == [(code, "Config/config.yml"), ("too_few_frames", "")]
+    assert message in errors[0].message
+
+
 def test_sens_frames_are_ranges_of_the_stream(sens, make):
     with open_scan(sens.zip()) as archive:
         frame = read_scan(archive).manifest.frames[1]

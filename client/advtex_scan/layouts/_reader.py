@@ -184,7 +184,7 @@ def parse_size(width: str, height: str) -> tuple[int, int] | None:
     return int(width), int(height)
 
 
-def parse_settings(text: str) -> dict[str, str]:
+def parse_settings(text: str, separator: str = "=") -> dict[str, str]:
     """Lines of the form `key = value`."""
-    pairs = (line.split("=", 1) for line in text.splitlines() if "=" in line)
+    pairs = (line.split(separator, 1) for line in text.splitlines() if separator in line)
     return {key.strip(): value.strip() for key, value in pairs}

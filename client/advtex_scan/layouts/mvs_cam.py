@@ -6,8 +6,13 @@ come from `intrinsics.txt` with one line per camera,
     color 640 480 fx 582.871 fy 582.871 cx 320 cy 240
     depth 640 480 fx 583 fy 583 cx 320 cy 240
 
-(first pixel's centre at (0, 0)), else from the second line of each `.cam`: `f d0 d1 paspect ppx ppy` with f in units of
-the image's longer side and the principal point in units of its width and height, as mvs-texturing defines them.
+(first pixel's centre at (0, 0)), else from G2LTex's `Config/config.yml`, which holds one number in a line,
+
+    RGB_fx: 582.871        and RGB_fy, RGB_cx, RGB_cy, RGB_width, RGB_height; the same with depth_
+
+(its sample counts the first pixel's centre as (0, 0) too), else from the second line of each `.cam`:
+`f d0 d1 paspect ppx ppy` with f in units of the image's longer side and the principal point in units of its width and
+height, as mvs-texturing defines them.
 Depth is taken to be registered to color. Mesh: mesh.ply, else the one mesh that is there.
 """
 
@@ -20,12 +25,16 @@ from advtex_scan.archive import ScanArchive
 from advtex_scan.errors import ScanFormatError
 from advtex_scan.images import read_image_header
 from advtex_scan.layouts._mesh_choice import choose_mesh
-from advtex_scan.layouts._reader import IMAGE_SUFFIXES, Match, ScanReader, parse_numbers
+from advtex_scan.layouts._reader import IMAGE_SUFFIXES, Match, ScanReader, parse_numbers, parse_settings, parse_size
 from advtex_scan.manifest import FrameEntry, Intrinsics, Matrix4, ScanManifest
 from advtex_scan.matrices import invert_rigid, up_axis_of
 
 NAME = "mvs_cam"
 INTRINSICS_FILE = "intrinsics.txt"
+CONFIG_FILE = "Config/config.yml"
+CONFIG_PREFIXES = {"color": "RGB", "depth": "depth"}
+CONFIG_KEYS = ("fx", "fy", "cx", "cy", "width", "height")
+Cameras = dict[str, Intrinsics | None]  # "color", "depth"; None where what is stated is wrong, with a finding
 CAMERA_LINE = re.compile(
     r"\s*(color|depth)\s+(\d{1,6})\s+(\d{1,6})\s+fx\s+(\S+)\s+fy\s+(\S+)\s+cx\s+(\S+)\s+cy\s+(\S+)\s*"
 )
@@ -39,7 +48,7 @@ def detect(archive: ScanArchive) -> Match | None:
 
 def read(reader: ScanReader) -> ScanManifest | None:
     """All images with a `.cam`."""
-    cameras = _cameras(reader)
+    cameras = _cameras(reader) if INTRINSICS_FILE in reader.archive else _config_cameras(reader)
     images = [name for name in reader.archive.names() if name.lower().endswith(IMAGE_SUFFIXES)]
     by_stem = {name.rsplit(".", 1)[0]: name for name in images}
     cams = {name.removesuffix(".cam"): name for name in reader.archive.names() if name.endswith(".cam")}
@@ -56,7 +65,7 @@ def read(reader: ScanReader) -> ScanManifest | None:
 
 
 def _frame(
-    reader: ScanReader, stem: str, images: dict[str, str], cam: str | None, cameras: dict[str, Intrinsics]
+    reader: ScanReader, stem: str, images: dict[str, str], cam: str | None, cameras: Cameras
 ) -> FrameEntry | None:
     color = images.get(stem)
     folder, _, base = stem.rpartition("/")
@@ -71,7 +80,7 @@ def _frame(
         return None
     lines = (reader.text(cam) or "").strip().splitlines()
     pose = _pose(reader, lines, cam)
-    camera = cameras.get("color") or _own_intrinsics(reader, lines, cam, color)
+    camera = cameras["color"] if "color" in cameras else _own_intrinsics(reader, lines, cam, color)
     if pose is None or camera is None:
         return None
     return FrameEntry(sortable(stem), color, depth, pose, camera, cameras.get("depth"))
@@ -95,22 +104,42 @@ def _pose(reader: ScanReader, lines: list[str], cam: str) -> Matrix4 | None:
     return invert_rigid(world_to_camera) if world_to_camera else None
 
 
-def _cameras(reader: ScanReader) -> dict[str, Intrinsics]:
-    cameras: dict[str, Intrinsics] = {}
-    text = reader.text(INTRINSICS_FILE) if INTRINSICS_FILE in reader.archive else None
-    for line in (text or "").splitlines():
+def _cameras(reader: ScanReader) -> Cameras:
+    cameras: Cameras = {}
+    for line in (reader.text(INTRINSICS_FILE) or "").splitlines():
         match = CAMERA_LINE.fullmatch(line)
         values = parse_numbers(" ".join(match.groups()[3:])) if match else None
         if match and values and len(values) == 4:
             size = (int(match[2]), int(match[3]))
-            camera = reader.opencv_intrinsics((values[0], values[1], values[2], values[3]), size, INTRINSICS_FILE)
-            if camera:
-                cameras[match[1]] = camera
+            pinhole = (values[0], values[1], values[2], values[3])
+            cameras[match[1]] = reader.opencv_intrinsics(pinhole, size, INTRINSICS_FILE)
         elif line.strip() and not line.lstrip().startswith("#"):
             message = f"a line is not understood: {line.strip()[:80]!r}"
             reader.findings.error(
                 "bad_numbers", INTRINSICS_FILE, message, "write: color WIDTH HEIGHT fx F fy F cx C cy C"
             )
+    return cameras
+
+
+def _config_cameras(reader: ScanReader) -> Cameras:
+    """What `Config/config.yml` says about each camera that it names; it is YAML of the flattest kind."""
+    text = reader.text(CONFIG_FILE) if CONFIG_FILE in reader.archive else None
+    lines = (line.partition("#")[0] for line in (text or "").splitlines())
+    settings = parse_settings("\n".join(lines), ":")
+    cameras: Cameras = {}
+    for kind, prefix in CONFIG_PREFIXES.items():
+        words = [settings.get(f"{prefix}_{key}", "") for key in CONFIG_KEYS]
+        if not any(words):
+            continue
+        values, size = parse_numbers(" ".join(words[:4])), parse_size(words[4], words[5])
+        if not all(words) or values is None or len(values) != 4 or size is None:
+            remedy = "write fx, fy, cx, cy, width and height of each camera, in pixels"
+            message = f"{prefix}_fx to {prefix}_height do not describe a camera"
+            reader.findings.error("bad_numbers", CONFIG_FILE, message, remedy)
+            cameras[kind] = None
+        else:
+            pinhole = (values[0], values[1], values[2], values[3])
+            cameras[kind] = reader.opencv_intrinsics(pinhole, size, CONFIG_FILE)
     return cameras
 
 

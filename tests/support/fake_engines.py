@@ -158,6 +158,12 @@ def hangs(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: b
     time.sleep(600)
 
 
+def hangs_alone(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
+    """The same in native code that keeps the interpreter's lock: no other thread runs either."""
+    monitor.stage_started("atlas")
+    ctypes.PyDLL(None).sleep(600)
+
+
 def ignores_stop(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
     """Works on, whatever it is asked."""
     monitor.stage_started("optimization")

@@ -12,6 +12,7 @@ from typing import Any
 
 import fake_engines
 import pytest
+import structlog
 
 from advtex_contract.jobs import JobState
 from advtex_store import keys
@@ -236,6 +237,35 @@ def test_a_cancel_does_not_wait_for_a_long_fetch(
     assert store.records.job(job_id).state == JobState.canceled
 
 
+@pytest.mark.parametrize("slow", ["restore", "commit", "checkpoint"])
+def test_a_cancel_does_not_wait_for_the_storage(
+    store: Store, host: Hosts, new_job: NewJob, monkeypatch: pytest.MonkeyPatch, slow: str
+) -> None:
+    """Neither for a checkpoint on its way here, nor for results or a checkpoint on their way there."""
+    job_id = new_job(steps=20 if slow == "commit" else 1000)
+    hung, go_on = threading.Event(), threading.Event()
+
+    def hang(*_arguments: Any) -> Any:
+        hung.set()
+        go_on.wait(20)
+        raise BlobsUnavailable("no answer")
+
+    if slow == "restore":
+        monkeypatch.setattr("advtex_worker.attempt.restore", hang)
+    elif slow == "commit":
+        monkeypatch.setattr(Results, "commit", hang)
+    else:
+        monkeypatch.setattr(FolderBlobs, "upload", hang)
+    thread = in_background(host("stepping"), job_id)
+    assert hung.wait(10)
+    asked = time.monotonic()
+    store.records.cancel(job_id)
+    wait_until(lambda: store.records.job(job_id).state == JobState.canceled)
+    assert time.monotonic() - asked < 2.0
+    go_on.set()
+    thread.join()
+
+
 def test_a_storage_that_fails_for_a_while_delays_the_results(
     store: Store, host: Hosts, new_job: NewJob, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -273,13 +303,38 @@ def test_a_runner_that_does_not_stop_is_killed_after_the_grace(
     store: Store, host: Hosts, new_job: NewJob, engine: str
 ) -> None:
     job_id = new_job()
-    thread = in_background(host(engine), job_id)
+    given = host(engine)
+    thread = in_background(given, job_id)
     wait_until(lambda: store.records.job(job_id).progress["stage"] != "")
     asked = time.monotonic()
-    store.records.cancel(job_id)
+    given.stop_signal._on_signal(signal.SIGTERM, None)
     thread.join()
     assert 1.0 <= time.monotonic() - asked < 4.0
-    assert store.records.job(job_id).state == JobState.canceled
+    assert store.records.job(job_id).state == JobState.preempted
+
+
+@pytest.mark.parametrize("asked_before", [False, True])
+@pytest.mark.parametrize(("engine", "ends"), [("hangs", "stopped"), ("ignores_stop", "stopped"), ("hangs_alone", None)])
+def test_a_cancel_in_a_long_stage_is_recorded_within_two_seconds(
+    store: Store, settings: WorkerSettings, new_job: NewJob, engine: str, ends: str | None, asked_before: bool
+) -> None:
+    """The runner ends by itself; only one that cannot run Python at all is killed. A drain before changes nothing."""
+    usual = {name: WorkerSettings.model_fields[name].default for name in ("heartbeat_seconds", "grace_seconds")}
+    given = Host(settings.model_copy(update=usual), engine=f"fake_engines:{engine}")
+    job_id = new_job()
+    with structlog.testing.capture_logs() as lines:
+        thread = in_background(given, job_id)
+        wait_until(lambda: store.records.job(job_id).progress["stage"] != "")
+        if asked_before:
+            given.stop_signal._on_signal(signal.SIGTERM, None)
+        asked = time.monotonic()
+        store.records.cancel(job_id)
+        wait_until(lambda: store.records.job(job_id).state == JobState.canceled)
+        took = time.monotonic() - asked
+        thread.join()
+    assert took < 2.0
+    (ending,) = [line["ending"] for line in lines if line["event"] == "runner ended"]
+    assert ending == (ends or "the engine's process was killed (out of memory?): SIGKILL")
 
 
 def test_a_lost_lease_ends_the_runner_and_commits_nothing(store: Store, host: Hosts, new_job: NewJob) -> None:

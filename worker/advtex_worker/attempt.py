@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import fcntl
+import math
 import os
 import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, wait
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,6 +41,9 @@ from advtex_worker.progress import ProgressTracker
 from advtex_worker.settings import WorkerSettings
 
 RETRY_SECONDS = 5.0
+KILL_SECONDS = 1.0  # after a cancel: a runner whose interpreter is held by native code does not hear it
+POLL_SECONDS = 0.05
+RECORD_SECONDS = 1.2  # after a cancel: what is not in the storage by then stays out of it
 WORKSPACE = "attempt-"  # what the names of workspaces begin with; other folders beside them are nobody's business here
 
 T = TypeVar("T")
@@ -131,7 +136,8 @@ class Attempt:
             log_tail=self._log_tail,
         )
         self._child: Child | None = None
-        self._killer: threading.Timer | None = None
+        self._killers: list[threading.Timer] = []
+        self._canceled_at = math.inf
         self._warnings: tuple[ErrorDetail, ...] = ()
         self._log = log.bind(job=claim.job_id, attempt=claim.attempt)
 
@@ -163,13 +169,14 @@ class Attempt:
 
     def _run(self) -> None:
         try:
-            self._persist(self._fetch_scan)
+            self._transfer(self._fetch_scan)
         except (BlobNotFound, ReferenceRefused) as missing:
             message = "the scan is no longer stored; submit it again"
             error = JobError(code="scan_missing", message=str(missing) if self._claim.source else message)
             self._record(lambda: self._store.records.fail(self._job_id, self._number, error))
             return
-        base = self._persist(lambda: restore(self._store.blobs, self._job_id, self._number, self._space.work))
+        base = self._transfer(lambda: restore(self._store.blobs, self._job_id, self._number, self._space.work))
+        self._check_ending()
         self._warnings = base.warnings
         self._log.info("attempt begins", resumed_files=len(base.files))
         uploader = CheckpointUploader(self._store.blobs, self._job_id, self._number, base, self._keeper.beat)
@@ -179,12 +186,12 @@ class Attempt:
                 self._child = child
                 ended = self._listen(child, uploader)
         finally:
-            if self._killer:
-                self._killer.cancel()
+            for killer in self._killers:
+                killer.cancel()
             if self._keeper.ending is Ending.lost or isinstance(ended, FinishedEvent):
-                uploader.abandon()
+                uploader.abandon(self._out_of_time)
             else:
-                uploader.finish()
+                uploader.finish(self._out_of_time)
         self._conclude(ended, child.returncode)
 
     def _fetch_scan(self) -> None:
@@ -221,7 +228,7 @@ class Attempt:
     def _listen(self, child: Child, uploader: CheckpointUploader) -> FinishedEvent | FailedEvent | StoppedEvent | None:
         """Everything the runner says, in order. -> how it said that it ended, None if it died."""
         if self._keeper.ending:  # asked before there was anybody to ask
-            self._on_ending(self._keeper.ending)
+            self._on_ending(Ending.cancel if self._canceled else self._keeper.ending)
         tracker = ProgressTracker()
         for event in child.events():
             match event:
@@ -247,7 +254,7 @@ class Attempt:
         self._keeper.beat()  # the newest progress is recorded before the end
         tail = self._log_tail()
         if isinstance(ended, FinishedEvent):
-            self._persist(lambda: self._store.results.commit(job_id, number, self._space.results(), self._warnings))
+            self._transfer(lambda: self._store.results.commit(job_id, number, self._space.results(), self._warnings))
             with suppress(Exception):  # they are only worth their space now; deleting the job removes them too
                 self._store.blobs.delete_prefix(keys.checkpoints_prefix(job_id))
         elif isinstance(ended, FailedEvent) and ended.code == "invalid_scan":
@@ -273,17 +280,33 @@ class Attempt:
             self._record(lambda: records.preempt(job_id, number))
 
     def _on_ending(self, ending: Ending) -> None:
+        if ending is Ending.cancel:
+            self._canceled_at = min(self._canceled_at, time.monotonic())
         child = self._child
         if child is None:
             return
         if ending is Ending.lost:
             child.kill()
-            return
-        child.ask_to_stop()
-        if self._killer is None:
-            self._killer = threading.Timer(self._settings.grace_seconds, child.kill)
-            self._killer.daemon = True
-            self._killer.start()
+        elif ending is Ending.cancel:
+            child.cancel()
+            self._kill_after(KILL_SECONDS, child)
+        else:
+            child.ask_to_stop()
+            self._kill_after(self._settings.grace_seconds, child)
+
+    def _kill_after(self, seconds: float, child: Child) -> None:
+        killer = threading.Timer(seconds, child.kill)
+        killer.daemon = True
+        killer.start()
+        self._killers.append(killer)
+
+    @property
+    def _canceled(self) -> bool:
+        """Also after a SIGTERM, which stays the ending."""
+        return self._canceled_at < math.inf
+
+    def _out_of_time(self) -> bool:
+        return time.monotonic() - self._canceled_at >= RECORD_SECONDS
 
     def _log_tail(self) -> str:
         return self._child.log_tail() if self._child else ""
@@ -297,6 +320,25 @@ class Attempt:
                 self._log.warning("the end cannot be recorded, trying again", error=str(error))
             time.sleep(0.5)
         raise Interrupted
+
+    def _transfer(self, action: Callable[[], T]) -> T:
+        """`_persist` for what may take long. A cancel leaves it behind: nothing that it still writes counts."""
+        return self._persist(lambda: self._unless_canceled(action))
+
+    def _unless_canceled(self, action: Callable[[], T]) -> T:
+        future: Future[T] = Future()
+
+        def act() -> None:
+            try:
+                future.set_result(action())
+            except BaseException as error:
+                future.set_exception(error)
+
+        threading.Thread(target=act, name="transfer", daemon=True).start()
+        while not wait([future], timeout=POLL_SECONDS).done:
+            if self._canceled:
+                raise Interrupted
+        return future.result()
 
     def _persist(self, action: Callable[[], T]) -> T:
         """Try until the storage plays along: a full disk or an unreachable bucket pauses the work and loses nothing."""

@@ -26,6 +26,7 @@ from advtex_store.errors import BlobNotFound
 INDEX = "index.json"
 REST_FACTOR = 4.0  # after an upload, rest this many times as long as it took
 RETRY_SECONDS = 5.0
+JOIN_SECONDS = 0.05
 
 log = structlog.get_logger()
 
@@ -125,17 +126,21 @@ class CheckpointUploader:
         for path in replaced:
             path.unlink(missing_ok=True)
 
-    def finish(self) -> None:
-        """Upload what is left and end the thread."""
+    def finish(self, out_of_time: Callable[[], bool] = lambda: False) -> None:
+        """Upload what is left and end the thread; once `out_of_time`, leave it behind and commit nothing more."""
         with self._changed:
             self._closing = True
             self._changed.notify()
-        self._thread.join()
+        while self._thread.is_alive():
+            if out_of_time():
+                self._abandoned = True
+                return
+            self._thread.join(JOIN_SECONDS)
 
-    def abandon(self) -> None:
-        """Commit nothing more: the attempt no longer holds its job."""
+    def abandon(self, out_of_time: Callable[[], bool] = lambda: False) -> None:
+        """Commit nothing more: the attempt no longer holds its job, or needs no checkpoint."""
         self._abandoned = True
-        self.finish()
+        self.finish(out_of_time)
 
     def _work(self) -> None:
         rest = 0.0

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
 
-from advtex_worker.events import STOP_LINE, Event, Request, parse_event
+from advtex_worker.events import CANCEL_LINE, STOP_LINE, Event, Request, parse_event
 
 LOG_TAIL_BYTES = 6000
 KEPT_OUT = ("ADVTEX_", "AWS_")  # the runner reads hostile files: it gets no passwords
@@ -64,7 +64,12 @@ class Child:
             yield parse_event(line)
 
     def ask_to_stop(self) -> None:
+        """With a checkpoint, however long that takes."""
         self._write(STOP_LINE)
+
+    def cancel(self) -> None:
+        """The same within `CANCEL_SECONDS`, if need be without the checkpoint."""
+        self._write(CANCEL_LINE)
 
     def kill(self) -> None:
         """End it and whatever it started, at once."""

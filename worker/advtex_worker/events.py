@@ -1,7 +1,8 @@
 """All that the runner and its parent say to each other: one JSON object per line.
 
-The parent writes one `Request` to the runner's stdin and, when it wants it to end, the line `stop`. The runner writes
-events to its stdout; what libraries print goes to the log instead.
+The parent writes one `Request` to the runner's stdin and, when it wants it to end, the line `stop` or `cancel`: the
+engine then ends at its next step with a checkpoint, after a cancel within `CANCEL_SECONDS` wherever it is. The runner
+writes events to its stdout; what libraries print goes to the log instead.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from advtex_contract.errors import ErrorDetail
 from advtex_contract.options import JobOptions
 
 STOP_LINE = "stop\n"
+CANCEL_LINE = "cancel\n"
+CANCEL_SECONDS = 0.7
 
 
 class _Message(BaseModel):
@@ -83,7 +86,7 @@ class FailedEvent(_Message):
 
 
 class StoppedEvent(_Message):
-    """It was asked to stop and has reported its checkpoint."""
+    """It was asked to stop. Its checkpoint is reported, unless a cancel left no time for one."""
 
     kind: Literal["stopped"] = "stopped"
 

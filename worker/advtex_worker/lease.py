@@ -57,6 +57,7 @@ class LeaseKeeper:
         self._beating = threading.Lock()
         self._deciding = threading.Lock()
         self.ending: Ending | None = None
+        self._told: set[Ending] = set()
         self._threads = [
             threading.Thread(target=self._work, name="lease", daemon=True),
             threading.Thread(target=self._watch, name="lease watch", daemon=True),
@@ -79,8 +80,9 @@ class LeaseKeeper:
     def end(self, ending: Ending) -> None:
         """The run has to end."""
         with self._deciding:
-            if self.ending is ending or self.ending is Ending.lost:
+            if ending in self._told or self.ending is Ending.lost:
                 return
+            self._told.add(ending)
             if self.ending is None or ending is Ending.lost:
                 self.ending = ending
             self._on_ending(ending)

@@ -13,16 +13,19 @@ import os
 import signal
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Never
 
 from advtex_contract.errors import ErrorDetail
 from advtex_engine.errors import EngineError, OptionError, Problem, ScanError, Stopped
 from advtex_engine.monitor import Monitor
 from advtex_worker.adapt import texture_config
 from advtex_worker.events import (
+    CANCEL_LINE,
+    CANCEL_SECONDS,
     STOP_LINE,
     CheckpointEvent,
     Ending,
@@ -49,10 +52,19 @@ class Reporter(Monitor):
         self._events = events
         self._stop = stop
         self._snapshots = 0
+        self._telling = threading.Lock()
 
     def tell(self, event: Event) -> None:
-        self._events.write(event.line())
-        self._events.flush()
+        with self._telling:
+            self._events.write(event.line())
+            self._events.flush()
+
+    def end(self, ending: Ending) -> Never:
+        """Tell it and exit at once, from any thread: no destructor of a native library may spoil a finished run."""
+        self.tell(ending)
+        with self._telling:  # no event of another thread is cut off
+            sys.stderr.flush()
+            os._exit(0)
 
     def stage_started(self, stage: str) -> None:
         self.tell(StageEvent(stage=stage))
@@ -154,10 +166,13 @@ def _detail(problem: Problem, severity: Any) -> ErrorDetail:
     )
 
 
-def _listen(control: IO[str], stop: threading.Event) -> None:
+def _listen(control: IO[str], stop: threading.Event, reporter: Reporter) -> None:
     for line in control:
-        if line == STOP_LINE:
+        if line in (STOP_LINE, CANCEL_LINE):
             stop.set()
+        if line == CANCEL_LINE:
+            time.sleep(CANCEL_SECONDS)  # the engine may come to a step, where it writes its checkpoint and ends
+            reporter.end(StoppedEvent())  # files are replaced whole: an exit spoils none
     stop.set()  # the parent closed the line
 
 
@@ -169,11 +184,9 @@ def main() -> None:
     request = Request.model_validate_json(sys.stdin.readline())
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda _signum, _frame: stop.set())  # whoever stops all processes at once
-    threading.Thread(target=_listen, args=(sys.stdin, stop), daemon=True).start()
     reporter = Reporter(request, events, stop)
-    reporter.tell(run(request, reporter))
-    sys.stderr.flush()
-    os._exit(0)  # no destructor of a native library may spoil a finished run
+    threading.Thread(target=_listen, args=(sys.stdin, stop, reporter), daemon=True).start()
+    reporter.end(run(request, reporter))
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from advtex_engine.depth import DepthEncoding, Raw, depth_in_color_image, inflate, measure_depth
+from advtex_engine.depth import ROTATED, DepthEncoding, Raw, depth_in_color_image, inflate, measure_depth
 from advtex_engine.errors import Problem
 from advtex_engine.monitor import Monitor
 from advtex_engine.scene import Camera, Mesh
@@ -63,6 +63,12 @@ def test_zero_and_all_ones_are_no_reading(rotated: bool) -> None:
     metres = DepthEncoding("any", 1000.0, rotated).metres(np.array([[0, 65535]], np.uint16))
     assert metres.tolist() == [[0, 0]]
     assert metres.dtype == np.float32
+
+
+def test_rotated_tenths_of_a_millimetre_end_at_six_metres() -> None:
+    tenths = next(encoding for encoding in ROTATED if encoding.units_per_metre == 10_000)
+    depth = np.array([[0.5, 5.9999, 6.0, 6.0001, 6.5534]])
+    np.testing.assert_allclose(tenths.metres(stored(depth, tenths)), [[0.5, 5.9999, 6.0, 0, 0]], rtol=1e-6)
 
 
 @pytest.mark.parametrize(

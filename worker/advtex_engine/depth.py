@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,23 +33,27 @@ MIN_READINGS = 500
 class DepthEncoding:
     """How metres are stored in 16 bits: units per metre, after rotating the bits left by 3 places if `rotated`.
 
+    farthest: metres; what is stored beyond is no reading.
     SUN3D and its kin store d as (d << 3) | (d >> 13), so that viewers show something: d = (v >> 3) | (v << 13).
     """
 
     name: str
     units_per_metre: float
     rotated: bool = False
+    farthest: float = math.inf
 
     def metres(self, raw: Raw) -> npt.NDArray[np.float32]:
         """[H,W] uint16 -> [H,W] float32 metres, 0 = no reading."""
         units = (raw >> 3) | (raw << 13) if self.rotated else raw
         empty = np.isin(raw, NO_READING) | np.isin(units, NO_READING)
-        return np.where(empty, np.float32(0), units.astype(np.float32) / np.float32(self.units_per_metre))
+        metres = units.astype(np.float32) / np.float32(self.units_per_metre)
+        return np.where(empty | (metres > self.farthest), np.float32(0), metres)
 
 
 ROTATED = (
     DepthEncoding("bit-rotated millimetres", 1_000.0, rotated=True),
-    DepthEncoding("bit-rotated tenths of a millimetre", 10_000.0, rotated=True),
+    # 16 bits end at 6.55 m here; what stands close to that end is a mark or an overflow, no reading.
+    DepthEncoding("bit-rotated tenths of a millimetre", 10_000.0, rotated=True, farthest=6.0),
 )
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import cast
 
-from advtex_scan.manifest import Matrix4, UpAxis
+from advtex_scan.manifest import IDENTITY, Matrix4, UpAxis
 
 ROTATION_TOLERANCE = 0.01  # largest entry of |R Rᵀ - I|; six printed digits (ScanNet) give about 1e-6
 
@@ -16,6 +16,12 @@ def matrix4(values: Sequence[float]) -> Matrix4:
     full = [*values, 0.0, 0.0, 0.0, 1.0] if len(values) == 12 else list(values)
     assert len(full) == 16
     return cast(Matrix4, tuple(tuple(float(value) for value in full[row : row + 4]) for row in range(0, 16, 4)))
+
+
+def says_nothing(values: Sequence[float]) -> bool:
+    """Whether 16 numbers are the identity, or all 0, as some writers leave a matrix that they do not know."""
+    unit = [value for row in IDENTITY for value in row]
+    return not any(values) or all(abs(a - b) <= 1e-6 for a, b in zip(values, unit, strict=True))
 
 
 def compose(a: Matrix4, b: Matrix4) -> Matrix4:

@@ -178,6 +178,25 @@ def test_bundlefusion_info_with_another_color_size(seven, make):
     assert [finding.code for finding in found.report.findings if finding.severity == "warning"] == ["color_scaled"]
 
 
+@pytest.mark.parametrize("camera", ["Color", "Depth"])
+def test_bundlefusion_extrinsics_are_ignored_with_a_warning(seven, camera):
+    def warnings(matrix) -> list[str]:
+        line = " ".join(str(value) for value in np.ravel(matrix))
+        seven.files["info.txt"] = f"m_depthShift = 1000\nm_calibration{camera}Extrinsic = {line} \n".encode()
+        report = reading(seven.folder()).report
+        assert report.ok
+        found = [finding for finding in report.findings if finding.severity == "warning"]
+        assert all(finding.code == "extrinsic_ignored" and finding.remedy for finding in found)
+        return [f"{finding.where}: {finding.message}" for finding in found]
+
+    assert warnings(np.eye(4)) == warnings(np.zeros((4, 4))) == []
+    ignored = f"info.txt: m_calibration{camera}Extrinsic is not the identity and is ignored"
+    assert warnings(offset_transform()) == [ignored]
+    assert warnings(np.eye(3)) == [f"info.txt: m_calibration{camera}Extrinsic does not hold 16 numbers and is ignored"]
+    seven.files["depth-to-color.txt"] = text(offset_transform())
+    assert warnings(offset_transform()) == [], "the remedy helps"
+
+
 def test_depth_without_intrinsics_of_its_own_is_taken_as_registered(seven):
     seven.files["camera-intrinsics.color.txt"] = seven.files.pop("camera-intrinsics.txt")
     found = reading(seven.folder())

@@ -15,7 +15,7 @@ from advtex_scan.layouts._mesh_choice import choose_mesh
 from advtex_scan.layouts._reader import Match, ScanReader
 from advtex_scan.layouts._scannet_info import documented_meshes, read_scene_info
 from advtex_scan.manifest import IDENTITY, FrameEntry, Intrinsics, Matrix4, ScanManifest
-from advtex_scan.matrices import compose, invert_rigid, matrix4
+from advtex_scan.matrices import compose, invert_rigid, says_nothing
 
 NAME = "scannet"
 FRAME = re.compile(r"(color|depth|pose)/(\d{1,9})\.(jpg|jpeg|png|txt)")
@@ -73,11 +73,7 @@ def _camera(reader: ScanReader, name: str, size: tuple[int, int] | None) -> Intr
 
 def _check_identity(reader: ScanReader, name: str) -> None:
     values = reader.numbers(name, (16,))
-    if values and any(
-        abs(a - b) > 1e-6
-        for row, unit in zip(matrix4(values), IDENTITY, strict=True)
-        for a, b in zip(row, unit, strict=True)
-    ):
+    if values and not says_nothing(values):
         remedy = "state the color camera by colorToDepthExtrinsics in the scene's .txt"
         reader.findings.warning("extrinsic_ignored", name, "is not the identity and is ignored", remedy)
 

@@ -21,7 +21,7 @@ from advtex_scan.layouts._mesh_choice import choose_mesh
 from advtex_scan.layouts._reader import Match, ScanReader
 from advtex_scan.layouts._scannet_info import documented_meshes, read_scene_info
 from advtex_scan.manifest import IDENTITY, ByteRange, FrameEntry, Intrinsics, Matrix4, ScanManifest
-from advtex_scan.matrices import compose, invert_rigid
+from advtex_scan.matrices import compose, invert_rigid, says_nothing
 
 NAME = "sens"
 VERSION = 4
@@ -117,10 +117,8 @@ def _pinhole(matrix: tuple[float, ...]) -> tuple[float, float, float, float]:
 
 
 def _check_extrinsics(reader: ScanReader, path: str, matrices: tuple[tuple[float, ...], ...]) -> None:
-    unit = [value for row in IDENTITY for value in row]
     for matrix in matrices:
-        # Some writers leave the matrices empty; those and the identity say nothing.
-        if any(matrix) and not all(abs(a - b) <= 1e-6 for a, b in zip(matrix, unit, strict=True)):
+        if not says_nothing(matrix):
             remedy = "state the color camera by colorToDepthExtrinsics in the scene's .txt"
             reader.findings.warning("extrinsic_ignored", path, "an extrinsic matrix of a camera is ignored", remedy)
 

@@ -18,7 +18,7 @@ from advtex_scan.archive import ScanArchive
 from advtex_scan.layouts._mesh_choice import choose_mesh
 from advtex_scan.layouts._reader import Match, ScanReader, parse_numbers, parse_settings, parse_size
 from advtex_scan.manifest import IDENTITY, FrameEntry, Intrinsics, Matrix4, ScanManifest
-from advtex_scan.matrices import compose, invert_rigid, up_axis_of
+from advtex_scan.matrices import compose, invert_rigid, says_nothing, up_axis_of
 
 NAME = "seven_scenes"
 FRAME = re.compile(r"((?:.*/)?frame-\d+)\.(color|depth|pose)\.(jpg|jpeg|png|txt)")
@@ -58,6 +58,8 @@ def read(reader: ScanReader) -> ScanManifest | None:
         remedy = f"add {COLOR_FILES[0]} or {COMMON_FILE} with the 3x3 matrix"
         reader.findings.error("no_color_intrinsics", "", "there are no color intrinsics", remedy)
     depth_to_color = _depth_to_color(reader)
+    if depth_to_color is None:
+        _check_extrinsics(reader, info)
     entries = [_entry(reader, name, frame, color, depth, depth_to_color) for name, frame in frames.items()]
     usable = tuple(entry for entry in entries if entry)
     return ScanManifest(
@@ -130,6 +132,19 @@ def _depth_to_color(reader: ScanReader) -> Matrix4 | None:
         if name in reader.archive:
             return reader.rigid_file(name)
     return None
+
+
+def _check_extrinsics(reader: ScanReader, info: dict[str, str]) -> None:
+    for key in ("m_calibrationColorExtrinsic", "m_calibrationDepthExtrinsic"):
+        values = parse_numbers(info.get(key, ""))
+        if values is None or len(values) not in (0, 16):
+            message = f"{key} does not hold 16 numbers and is ignored"
+        elif values and not says_nothing(values):
+            message = f"{key} is not the identity and is ignored"
+        else:
+            continue
+        remedy = f"state where the color camera is in {TRANSFORM_FILES[0]}"
+        reader.findings.warning("extrinsic_ignored", INFO_FILE, message, remedy)
 
 
 def _depth_scale(reader: ScanReader, info: dict[str, str]) -> float:

@@ -23,6 +23,7 @@ from advtex_client.errors import (
     ServerError,
     WaitTimeoutError,
 )
+from advtex_client.manifests import retention_seconds
 from advtex_contract.options import METHOD_HELP, PRESET_HELP, JobOptions, Method, Preset
 
 EXIT_CODES: dict[type[ClientError], int] = {
@@ -54,6 +55,9 @@ SizeOption = Annotated[str | None, typer.Option("--size", metavar="WxH", help="w
 HoldoutOption = Annotated[int | None, typer.Option("--holdout", help="leave out every Nth frame and score on it")]
 StepsOption = Annotated[int | None, typer.Option("--steps", help="overrides the preset's step count")]
 PriorityOption = Annotated[int, typer.Option("--priority", min=-100, max=100, help="larger runs earlier")]
+KeepOption = Annotated[
+    float | None, typer.Option("--keep-days", help="how long a job is kept after its end; else the server's usual time")
+]
 
 
 @contextmanager
@@ -79,6 +83,14 @@ def parsed_size(size: str | None) -> tuple[int | None, int | None]:
     if match is None:
         raise ClientError(f"--size {size!r} is no size; give it as WxH in pixels, for example 320x240")
     return int(match[1]), int(match[2])
+
+
+def retention(keep_days: float | None) -> int | None:
+    """`--keep-days` in seconds; ClientError."""
+    try:
+        return None if keep_days is None else retention_seconds(keep_days)
+    except ValueError as error:
+        raise ClientError(f"--keep-days {keep_days}: {error}") from error
 
 
 def job_options(**given: object) -> JobOptions:

@@ -70,18 +70,18 @@ class Display:
             yield lambda: bars.advance(task)
 
     @contextmanager
-    def batch_bar(self) -> Iterator[Callable[[BatchView], None]]:
+    def batch_bar(self) -> Iterator[Callable[[BatchView, Sequence[str]], None]]:
         """A bar of the jobs that have ended; a line per change where stderr is no terminal."""
         columns = (TextColumn("{task.description}"), BarColumn())
         with Progress(*columns, console=self.notes, transient=True, disable=not self._bars) as bars:
             task = bars.add_task("", total=None)
 
-            def show(batch: BatchView) -> None:
+            def show(batch: BatchView, reasons: Sequence[str]) -> None:
                 if self._bars:
                     ended = sum(count for state, count in batch.states.items() if state in TERMINAL)
-                    bars.update(task, description=batch_line(batch), total=batch.jobs, completed=ended)
+                    bars.update(task, description=batch_line(batch, reasons), total=batch.jobs, completed=ended)
                 else:
-                    self.once(batch_line(batch.model_copy(update={"eta_seconds": None})))
+                    self.once(batch_line(batch.model_copy(update={"eta_seconds": None}), reasons))
 
             yield show
 
@@ -128,6 +128,8 @@ class JobBar:
     def show(self, job: JobView) -> None:
         progress = job.progress
         where = progress.stage if job.state is JobState.running and progress.stage else job.state.value
+        if job.waiting_reason:
+            where += f" ({job.waiting_reason})"
         if self._bars.disable and where != self._said:
             self._display.note(f"job {job.id}: {where}")
         self._said = where
@@ -163,6 +165,8 @@ def job_lines(job: JobView) -> str:
     """A job for people."""
     progress = job.progress
     lines = [f"job      {job.id}", f"state    {job.state}" + (f" (attempt {job.attempt})" if job.attempt > 1 else "")]
+    if job.waiting_reason:
+        lines.append(f"waits    {job.waiting_reason}")
     if job.label:
         lines.append(f"label    {job.label}")
     if progress.stage:
@@ -179,27 +183,30 @@ def job_lines(job: JobView) -> str:
     lines += [f"result   {file.name} ({file.size} bytes)" for file in job.results]
     if job.expires_at:
         lines.append(f"kept until {job.expires_at.astimezone(UTC):%Y-%m-%d %H:%M} UTC")
+    elif job.retention_seconds:
+        lines.append(f"kept     {job.retention_seconds / 86400:.4g} days after its end")
     return "\n".join(lines)
 
 
 def job_table(jobs: Sequence[JobView]) -> str:
-    """Jobs as a table for people, newest first."""
+    """Jobs as a table for people, newest first; the stage of one that waits is why it does."""
     table = Table(box=None, pad_edge=False)
     for title in ("job", "state", "stage", "created", "label"):
         table.add_column(title, overflow="fold")
     for job in jobs:
         progress = job.progress
         stage = f"{progress.stage} {progress.step}/{progress.steps}" if progress.steps else progress.stage
-        table.add_row(job.id, job.state, stage, f"{job.created_at:%Y-%m-%d %H:%M}", job.label)
+        table.add_row(job.id, job.state, job.waiting_reason or stage, f"{job.created_at:%Y-%m-%d %H:%M}", job.label)
     return _drawn(table)
 
 
-def batch_line(batch: BatchView) -> str:
-    """`night: 30 jobs, 12 succeeded, 18 queued, about 2 h 5 min left`."""
+def batch_line(batch: BatchView, reasons: Sequence[str] = ()) -> str:
+    """`night: 30 jobs, 12 succeeded, 18 queued, about 2 h 5 min left; waiting: no worker is running`."""
     parts = [f"{batch.jobs} jobs", *(f"{count} {state}" for state, count in sorted(batch.states.items()))]
     if batch.eta_seconds and not batch.finished:
         parts.append(f"about {duration(batch.eta_seconds)} left")
-    return f"{batch.id}: {', '.join(parts)}"
+    why = f"; waiting: {'; '.join(reasons)}" if reasons else ""
+    return f"{batch.id}: {', '.join(parts)}{why}"
 
 
 def batch_table(rows: Sequence[dict[str, Any]]) -> str:

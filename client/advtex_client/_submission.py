@@ -27,12 +27,23 @@ Steps = Generator[Step, Any, JobView]
 
 
 def job_spec(
-    options: JobOptions | None = None, label: str = "", batch: str | None = None, priority: int = 0, upload_id: str = ""
+    options: JobOptions | None = None,
+    label: str = "",
+    batch: str | None = None,
+    priority: int = 0,
+    retention_seconds: int | None = None,
 ) -> JobSpec:
-    """What to ask for; ClientError for what no server would accept."""
+    """What to ask for, with no upload yet; ClientError for what no server would accept."""
     options = options or JobOptions()
     try:
-        return JobSpec(upload_id=upload_id, options=options, label=label, batch=batch, priority=priority)
+        return JobSpec(
+            upload_id="",
+            options=options,
+            label=label,
+            batch=batch,
+            priority=priority,
+            retention_seconds=retention_seconds,
+        )
     except ValidationError as error:
         first = error.errors()[0]
         raise ClientError(f"{first['loc'][0]} {first['input']!r} cannot be used: {first['msg']}") from error

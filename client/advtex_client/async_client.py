@@ -86,14 +86,16 @@ class AsyncClient:
         *,
         label: str = "",
         priority: int = 0,
+        retention_seconds: int | None = None,
         new: bool = False,
         on_bytes: OnBytes | None = None,
     ) -> JobView:
         """Check, pack, send and queue a scan; the same scan with the same options and label gives the same job again.
 
         Raises ScanRejectedError, with every problem found, before anything is sent. `new` makes another job.
+        `retention_seconds`: how long it is kept after its end.
         """
-        spec = job_spec(options, label, priority=priority)
+        spec = job_spec(options, label, priority=priority, retention_seconds=retention_seconds)
         await run_sync(ensure_submittable, scan)
         with ExitStack() as stack:
             archive = await run_sync(stack.enter_context, packed(scan))

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -19,11 +21,13 @@ from advtex_client.errors import ApiError, AuthError, BusyError, ClientError, Ne
 from advtex_client.manifests import BatchItem
 from advtex_client.memory import SubmissionMemory, write_whole
 from advtex_contract.errors import ErrorCode
-from advtex_contract.jobs import JobView
+from advtex_contract.jobs import BatchView, JobSpec, JobState, JobView
 from advtex_contract.options import JobOptions
 
 REPORT = "report.json"
 AT_ONCE = 4  # requests for scans by reference; scans that are sent go one after the other
+ASKED_WHY = 100  # jobs that are asked why they wait
+WAITING = (JobState.queued, JobState.preempted)
 FULL_SECONDS = 15.0  # between looks whether a quota has room again
 
 OnFull = Callable[[ClientError], None]
@@ -48,6 +52,7 @@ class BatchRun(BaseModel):
     by_reference: bool
     options: JobOptions
     priority: int
+    retention_seconds: int | None = None
 
 
 def remember(server: str, batch_id: str, run: BatchRun, folder: Path | None = None) -> None:
@@ -72,7 +77,7 @@ def submit_batch(
     """One outcome per item, as they come. A scan that is refused does not stop the others; a lost line or a wrong key
     raises, and running it again goes on."""
     for item in items:
-        job_spec(item.options, item.label, batch_id, item.priority)  # nothing is sent if one cannot be
+        _spec(batch_id, item)  # nothing is sent if one cannot be
     sent = [item for item in items if item.path is not None]
     referred = [item for item in items if item.path is None]
     with ThreadPoolExecutor(AT_ONCE) as pool:
@@ -91,6 +96,16 @@ def result_rows(client: Client, batch_id: str) -> Iterator[dict[str, Any]]:
         if any(file.name == REPORT for file in job.results):
             row["scores"] = _scores(client, job)
         yield row
+
+
+def waiting_reasons(client: Client, batch: BatchView) -> list[str]:
+    """Why jobs of a batch wait, the most frequent reason first; of the newest ones, where there are many."""
+    found: Counter[str] = Counter()
+    for state in WAITING:
+        if batch.states.get(state):
+            jobs = islice(client.list_jobs(batch=batch.id, state=state), ASKED_WHY)
+            found.update(job.waiting_reason for job in jobs if job.waiting_reason)
+    return [reason for reason, _ in found.most_common()]
 
 
 def _scores(client: Client, job: JobView) -> dict[str, float]:
@@ -123,11 +138,15 @@ def _submitted(client: Client, batch_id: str, item: BatchItem, on_full: OnFull) 
 
 def _submit(client: Client, batch_id: str, item: BatchItem) -> JobView:
     memory = SubmissionMemory(client.config.url, "batch", batch_id, *item.identity)
-    spec = job_spec(item.options, item.label, batch_id, item.priority)
+    spec = _spec(batch_id, item)
     if item.path is not None:
         return client.submit_remembered(memory, item.path, spec)
     spec = spec.model_copy(update={"upload_id": None, "source": item.source})
     return client.create_job(spec, idempotency_key=memory.idempotency_key(memory.load()))
+
+
+def _spec(batch_id: str, item: BatchItem) -> JobSpec:
+    return job_spec(item.options, item.label, batch_id, item.priority, retention_seconds=item.retention_seconds)
 
 
 def _path(server: str, batch_id: str, folder: Path | None) -> Path:

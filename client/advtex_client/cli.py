@@ -19,6 +19,7 @@ from advtex_client._cli import (
     Folder,
     HoldoutOption,
     JobId,
+    KeepOption,
     MethodOption,
     PresetOption,
     PriorityOption,
@@ -30,6 +31,7 @@ from advtex_client._cli import (
     command,
     job_options,
     parsed_size,
+    retention,
 )
 from advtex_client._display import Display, finding_lines, job_lines, job_table
 from advtex_client.client import Client
@@ -73,6 +75,7 @@ def submit(
     max_texture_size: Annotated[int | None, typer.Option(help="cap on the texture's side, texels")] = None,
     label: Annotated[str, typer.Option(help="a name of your own for the job")] = "",
     priority: PriorityOption = 0,
+    keep_days: KeepOption = None,
     new: Annotated[bool, typer.Option("--new", help="make another job even if this scan was submitted before")] = False,
     wait: Annotated[bool, typer.Option("--wait", help="follow the job until it ends")] = False,
     output: Folder = None,
@@ -95,9 +98,18 @@ def submit(
             holdout=holdout,
             seed=seed,
         )
+        kept = retention(keep_days)
         with Client(url, api_key) as client:
             with display.bytes_bar("sending") as bar:
-                job = client.submit(scan, options, label=label, priority=priority, new=new, on_bytes=bar.upload)
+                job = client.submit(
+                    scan,
+                    options,
+                    label=label,
+                    priority=priority,
+                    retention_seconds=kept,
+                    new=new,
+                    on_bytes=bar.upload,
+                )
             for line in finding_lines(job.warnings):
                 display.note(line)
             if job.state in TERMINAL:

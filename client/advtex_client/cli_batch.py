@@ -14,6 +14,7 @@ from advtex_client._cli import (
     ApiKey,
     AsJson,
     HoldoutOption,
+    KeepOption,
     MethodOption,
     PresetOption,
     PriorityOption,
@@ -24,9 +25,10 @@ from advtex_client._cli import (
     command,
     job_options,
     parsed_size,
+    retention,
 )
 from advtex_client._display import Display, batch_line, batch_table, finding_lines
-from advtex_client.batches import BatchRun, remember, remembered, result_rows, submit_batch
+from advtex_client.batches import BatchRun, remember, remembered, result_rows, submit_batch, waiting_reasons
 from advtex_client.client import Client
 from advtex_client.errors import ClientError, JobFailedError, ScanRejectedError, WaitTimeoutError
 from advtex_client.manifests import read_items
@@ -56,6 +58,7 @@ def submit(
     holdout: HoldoutOption = None,
     steps: StepsOption = None,
     priority: PriorityOption = 0,
+    keep_days: KeepOption = None,
     wait: Wait = False,
     timeout: Seconds = None,
     url: Url = None,
@@ -64,13 +67,14 @@ def submit(
 ) -> None:
     """Submit every scan of a folder or manifest. Run again, it goes on: no scan is sent or queued twice.
 
-    A manifest has the columns path, label, options (a JSON object) and priority; paths are relative to it, or file://
-    and s3:// URLs that the server can read.
+    A manifest has the columns path, label, options (a JSON object), priority and keep_days; paths are relative to it,
+    or file:// and s3:// URLs that the server can read.
     """
     with command(as_json) as display, Client(url, api_key) as client:
         width, height = parsed_size(size)
         options = job_options(preset=preset, method=method, width=width, height=height, holdout=holdout, steps=steps)
         run = BatchRun(place=scans.absolute(), by_reference=by_reference, options=options, priority=priority)
+        run.retention_seconds = retention(keep_days)
         _submit(client, display, batch or _id_from(scans), run, wait, timeout)
 
 
@@ -106,7 +110,7 @@ def status(
         elif table:
             _show_table(client, display, view)
         else:
-            display.data(view, batch_line(view))
+            display.data(view, batch_line(view, () if display.as_json else waiting_reasons(client, view)))
 
 
 @app.command()
@@ -139,7 +143,7 @@ def list_(
 
 
 def _submit(client: Client, display: Display, batch_id: str, run: BatchRun, wait: bool, timeout: float | None) -> None:
-    items = read_items(run.place, run.options, run.priority, run.by_reference)
+    items = read_items(run.place, run.options, run.priority, run.by_reference, run.retention_seconds)
     remember(client.config.url, batch_id, run)
     display.note(f"batch {batch_id}: {len(items)} scans; broken off, `advtex-client batch resume {batch_id}` goes on")
     refused = 0
@@ -168,9 +172,10 @@ def _finish(client: Client, display: Display, view: BatchView, timeout: float | 
     started = time.monotonic()
     with display.batch_bar() as show:
         while not view.finished:
+            running = view.states.get(JobState.running)
+            show(view, () if running else waiting_reasons(client, view))
             if timeout is not None and time.monotonic() - started > timeout:
                 raise WaitTimeoutError(f"batch {view.id} did not end within {timeout:g} s; it goes on")
-            show(view)
             time.sleep(POLL_SECONDS)
             view = client.get_batch(view.id)
     _show_table(client, display, view)

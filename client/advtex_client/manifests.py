@@ -4,6 +4,7 @@ path       a scan's folder or zip, relative to the manifest, or its file:// or s
 label      the job's name; the last part of the path if it is left out
 options    a JSON object of options that differ from those of the command
 priority   larger runs earlier
+keep_days  how long the job is kept after its end
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from pydantic import ValidationError
 from advtex_client.errors import ClientError
 from advtex_contract.options import JobOptions
 
-COLUMNS = ("path", "label", "options", "priority")
+COLUMNS = ("path", "label", "options", "priority", "keep_days")
 SCHEMES = ("file://", "s3://")
 
 
@@ -33,17 +34,33 @@ class BatchItem:
     label: str
     options: JobOptions
     priority: int = 0
+    retention_seconds: int | None = None
 
     @property
     def identity(self) -> tuple[str, ...]:
         """What makes it the same item in a later run."""
-        return self.source or str(self.path), self.label, self.options.model_dump_json(), str(self.priority)
+        kept = () if self.retention_seconds is None else (f"kept {self.retention_seconds}",)
+        return self.source or str(self.path), self.label, self.options.model_dump_json(), str(self.priority), *kept
 
 
-def read_items(place: Path, options: JobOptions, priority: int = 0, by_reference: bool = False) -> list[BatchItem]:
+def retention_seconds(days: float) -> int:
+    """Whole seconds; ValueError for what is no time."""
+    if not 0 < days < 1e6:
+        raise ValueError(f"{days:g} is no number of days that a job could be kept")
+    return round(days * 86400)
+
+
+def read_items(
+    place: Path,
+    options: JobOptions,
+    priority: int = 0,
+    by_reference: bool = False,
+    retention: int | None = None,
+) -> list[BatchItem]:
     """The scans of a folder (each folder and zip in it), or those that a manifest lists; ClientError, with the line.
 
     by_reference: the server reads them at the same path; nothing is sent.
+    options, priority, retention (seconds): of those that say nothing else.
     """
     found: list[tuple[str, Mapping[str, Any]]]
     try:
@@ -56,7 +73,8 @@ def read_items(place: Path, options: JobOptions, priority: int = 0, by_reference
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         remedy = "give a folder of scans, a .csv or a .jsonl file"
         raise ClientError(f"{place} cannot be read: {error}; {remedy}") from error
-    items = [_item(where, row, base, options, priority, by_reference) for where, row in found]
+    usual = BatchItem(None, None, "", options, priority, retention)
+    items = [_item(where, row, base, usual, by_reference) for where, row in found]
     if not items:
         raise ClientError(f"{place} holds no scans; give the folder that holds their folders or zips, or a manifest")
     seen: dict[tuple[str, ...], str] = {}
@@ -91,9 +109,7 @@ def _rows(manifest: Path) -> Iterator[tuple[int, Mapping[str, Any]]]:
             yield number, parsed
 
 
-def _item(
-    where: str, row: Mapping[str, Any], base: Path, options: JobOptions, priority: int, by_reference: bool
-) -> BatchItem:
+def _item(where: str, row: Mapping[str, Any], base: Path, usual: BatchItem, by_reference: bool) -> BatchItem:
     if unknown := [str(name) for name in row if name not in COLUMNS]:
         raise ClientError(f"{where}: there is no column {unknown[0]!r}; the columns are {', '.join(COLUMNS)}")
     name, label = row.get("path"), row.get("label")
@@ -104,16 +120,17 @@ def _item(
     try:
         given = row.get("options", {})
         given = json.loads(given) if isinstance(given, str) else given
-        merged = JobOptions.model_validate(options.model_dump() | given)
-        wanted = int(row.get("priority", priority))
+        merged = JobOptions.model_validate(usual.options.model_dump() | given)
+        wanted = int(row.get("priority", usual.priority))
+        kept = retention_seconds(float(row["keep_days"])) if "keep_days" in row else usual.retention_seconds
     except ValidationError as error:
         first = error.errors()[0]
         raise ClientError(f"{where}: options.{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
-    except (ValueError, TypeError) as error:
-        raise ClientError(f"{where}: options must be a JSON object and priority a number: {error}") from error
+    except (ValueError, TypeError, OverflowError) as error:
+        kinds = "options must be a JSON object, priority and keep_days numbers"
+        raise ClientError(f"{where}: {kinds}: {error}") from error
+    item = replace(usual, label=str(label), options=merged, priority=wanted, retention_seconds=kept)
     if name.startswith(SCHEMES):
-        return BatchItem(None, name, str(label), merged, wanted)
+        return replace(item, source=name)
     path = (base / name).absolute()
-    if by_reference:
-        return BatchItem(None, path.as_uri(), str(label), merged, wanted)
-    return BatchItem(path, None, str(label), merged, wanted)
+    return replace(item, source=path.as_uri()) if by_reference else replace(item, path=path)

@@ -8,15 +8,18 @@ import subprocess
 import sys
 from pathlib import Path
 
+import httpx
 import pytest
-from fake_server import FakeServer, answers, refuses, view
+from fake_server import NOW, FakeServer, answers, refuses, view
 from typer.testing import CliRunner, Result
 
-from advtex_client import cli
+from advtex_client import cli, cli_batch
 from advtex_client._display import duration, job_lines, job_table
 from advtex_client.client import Client
 from advtex_contract.errors import ErrorCode, ErrorDetail
-from advtex_contract.jobs import JobError, JobState
+from advtex_contract.jobs import BatchView, JobError, JobPage, JobState
+
+WHY = "no worker is running"
 
 
 @pytest.fixture
@@ -81,6 +84,12 @@ def test_a_bad_scan_is_4_with_every_finding_and_its_remedy(server: FakeServer, s
     assert all(detail["remedy"] for detail in body["details"] if detail["severity"] == "error")
 
 
+def test_how_long_a_job_is_kept_is_asked_and_shown(server: FakeServer, scan: Path) -> None:
+    assert run("submit", scan, "--keep-days", "1.5").exit_code == 0
+    assert server.jobs["j0"].retention_seconds == 129_600
+    assert "1.5 days after its end" in run("status", "j0").stdout
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -89,6 +98,8 @@ def test_a_bad_scan_is_4_with_every_finding_and_its_remedy(server: FakeServer, s
         (["--steps", "0"], "steps"),
         (["--max-texture-size", "100000"], "max_texture_size"),
         (["--face-budget", "1"], "face_budget"),
+        (["--keep-days", "0"], "--keep-days 0"),
+        (["--keep-days", "0.0001"], "retention_seconds 9"),
         (["--preset", "turbo"], "turbo"),
         (["--method", "magic"], "magic"),
         (["--label", "two\nlines"], "label"),
@@ -178,6 +189,39 @@ def test_a_job_in_words() -> None:
     assert "left" not in text, "nothing is left of a job that has ended"
     running = job_lines(job.model_copy(update={"state": JobState.running}))
     assert "about 3 min 20 s" in running
+
+
+def test_why_a_job_waits_is_shown_wherever_it_is(server: FakeServer) -> None:
+    waiting = view("j0", waiting_reason=WHY)
+    server.jobs["j0"] = waiting
+    assert f"waits    {WHY}" in run("status", "j0").stdout
+    assert WHY in job_table([waiting])
+    server.script = [waiting, waiting, view("j0", JobState.running), view("j0", JobState.succeeded)]
+    notes = run("watch", "j0").stderr.splitlines()
+    assert notes == [f"job j0: queued ({WHY})", "job j0: running", "job j0: succeeded"]
+
+
+def test_a_batch_says_why_its_jobs_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    states = {JobState.queued: 3, JobState.succeeded: 1}
+    batch = BatchView(id="night", jobs=4, states=states, finished=False, created_at=NOW, updated_at=NOW)
+    reasons = ["it is too large", WHY, WHY]
+    jobs = [view(f"j{n}", waiting_reason=reason) for n, reason in enumerate(reasons)]
+
+    def handle(request: httpx.Request) -> httpx.Response:
+        if request.url.path == "/v1/batches/night":
+            return httpx.Response(200, text=batch.model_dump_json())
+        assert dict(request.url.params) == {"batch": "night", "state": "queued", "limit": "100"}
+        return httpx.Response(200, text=JobPage(jobs=jobs).model_dump_json())
+
+    def connect(url: str | None, api_key: str | None) -> Client:
+        return Client("http://server.test", "k", transport=httpx.MockTransport(handle))
+
+    monkeypatch.setattr(cli_batch, "Client", connect)
+    line = f"night: 4 jobs, 3 queued, 1 succeeded; waiting: {WHY}; it is too large\n"
+    assert run("batch", "status", "night").stdout == line
+    waited = run("batch", "status", "night", "--wait", "--timeout", "0")
+    assert waited.exit_code == 7
+    assert WHY in waited.stderr
 
 
 def test_submitting_a_finished_scan_again_says_so(server: FakeServer, scan: Path) -> None:

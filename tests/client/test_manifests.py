@@ -48,12 +48,13 @@ def test_a_folder_holds_scans(scenes: Path) -> None:
 
 def test_csv(scenes: Path) -> None:
     text = (
-        "\ufeffpath,label,options,priority\n"
-        'scene0000_00,"kitchen, north","{""steps"": 7, ""preset"": ""full""}",-3\n'
+        "\ufeffpath,label,options,priority,keep_days\n"
+        'scene0000_00,"kitchen, north","{""steps"": 7, ""preset"": ""full""}",-3,0.5\n'
         "\n"
-        "s3://scans/a b.zip,,,\n"
+        "s3://scans/a b.zip,,,,\n"
     )
-    local, referred = read_items(write(scenes, "list.csv", text), QUICK, priority=1)
+    local, referred = read_items(write(scenes, "list.csv", text), QUICK, priority=1, retention=86400)
+    assert (local.retention_seconds, referred.retention_seconds) == (43200, 86400)
     assert (local.path, local.label, local.priority) == (scenes / "scene0000_00", "kitchen, north", -3)
     assert local.options == JobOptions(preset=Preset.full, steps=7, seed=3)
     assert (referred.path, referred.source, referred.label) == (None, "s3://scans/a b.zip", "a b.zip")
@@ -77,7 +78,15 @@ def test_json_lines(scenes: Path) -> None:
         ("a.csv", 'path,options\nx,"{""steps"": 0}"\n', "line 2: options.steps"),
         ("a.csv", "path,options\nx,fast\n", "line 2: options must be a JSON object"),
         ("a.csv", "path,options\nx,3\n", "line 2: options must be a JSON object"),
-        ("a.csv", "path,priority\nx,high\n", "priority a number"),
+        ("a.csv", "path,priority\nx,high\n", "priority and keep_days numbers"),
+        ("a.jsonl", '{"path": "x", "priority": Infinity}\n', "priority and keep_days numbers"),
+        ("a.csv", "path,keep_days\nx,long\n", "priority and keep_days numbers"),
+        (
+            "a.csv",
+            "path,keep_days\nx,-1\n",
+            "priority and keep_days numbers: -1",
+        ),
+        ("a.jsonl", '{"path": "x", "keep_days": NaN}\n', "nan is no number of days"),
         ("a.csv", "path\nx,y,z\n", "line 2: there is no column"),
         ("a.csv", 'path\n"x\n', "cannot be read"),
         ("a.csv", "path\n", "holds no scans"),
@@ -106,7 +115,7 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
 
 values = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=10) | st.lists(st.integers())
 rows = st.dictionaries(
-    st.sampled_from(["path", "label", "options", "priority"]) | st.text(max_size=5),
+    st.sampled_from(["path", "label", "options", "priority", "keep_days"]) | st.text(max_size=5),
     values | st.dictionaries(st.sampled_from(["steps", "preset", "x"]), values, max_size=2),
     max_size=4,
 )

@@ -122,6 +122,7 @@ class FakeServer:
             return ok(self.jobs[job_id]) if earlier == body.decode() else error(422, ErrorCode.idempotency_mismatch)
         spec = JobSpec.model_validate_json(body)
         job = view(f"j{len(self.jobs)}", upload_id=spec.upload_id, options=spec.options, label=spec.label)
+        job.retention_seconds = spec.retention_seconds or 0
         self.jobs[job.id] = job
         self.keys[key] = (body.decode(), job.id)
         return ok(job, 201)

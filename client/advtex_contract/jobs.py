@@ -18,7 +18,8 @@ BatchId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{
 
 
 class JobState(StrEnum):
-    """`uploading` and `queued` wait, `running` and `preempted` are being worked on, the rest are final."""
+    """`queued` waits for a worker, `running` has one, `preempted` had to give its worker back and waits to go on, the
+    last four are final. `uploading` is reserved: a job is made of a finished upload, so none is ever in it."""
 
     uploading = "uploading"
     queued = "queued"

@@ -137,7 +137,8 @@ class Dispatcher:
         self.retention.expire()
         self.retention.purge()
         self.retention.tidy()
-        self.store.webhooks.drop_old()
+        if dropped := self.store.webhooks.drop_old():
+            log.warning("webhook deliveries given up", count=dropped)
         if time.monotonic() >= self._next_sweep:
             self._next_sweep = time.monotonic() + self.settings.sweep_seconds
             if orphans := self.retention.sweep():

@@ -146,14 +146,15 @@ class Webhooks:
             )
             return hook.disabled_at is not None
 
-    def drop_old(self) -> None:
-        """Forget what could not be delivered for long."""
+    def drop_old(self) -> int:
+        """Forget what could not be delivered for long. -> how many there were."""
         with self.database.read() as session:
             limit = self.database.now(session) - KEPT_SECONDS
             if session.scalar(select(DeliveryRow.id).where(DeliveryRow.created_at < limit).limit(1)) is None:
-                return
+                return 0
         with self.database.write() as session:
-            session.execute(delete(DeliveryRow).where(DeliveryRow.created_at < limit))
+            dropped = delete(DeliveryRow).where(DeliveryRow.created_at < limit).returning(DeliveryRow.id)
+            return len(session.scalars(dropped).all())
 
 
 def tell_webhooks(session: Session, row: JobRow, at: float) -> None:

@@ -74,8 +74,8 @@ def test_labels_are_one_printable_line(label: str) -> None:
 
 
 def test_terminal_states() -> None:
-    waiting_or_worked_on = {JobState.uploading, JobState.queued, JobState.running, JobState.preempted}
-    assert set(JobState) - TERMINAL == waiting_or_worked_on
+    not_ended = {JobState.uploading, JobState.queued, JobState.running, JobState.preempted}
+    assert set(JobState) - TERMINAL == not_ended
 
 
 def test_a_job_survives_the_wire() -> None:

@@ -148,9 +148,9 @@ def remaining_seconds(
 
 def _whole_seconds(progress: Progress) -> float | None:
     """What a running job will have taken for the stages up to this one, at its present rate of steps."""
-    if not progress.steps_per_second or not progress.steps:
+    if not progress.steps_per_second or progress.eta_seconds is None:
         return None
-    return sum(progress.stage_seconds.values()) + progress.steps / progress.steps_per_second
+    return sum(progress.stage_seconds.values()) + progress.eta_seconds
 
 
 def _kind(options: Mapping[str, Any]) -> str:

@@ -81,6 +81,7 @@ class Claim:
     scan_key: str
     source: str | None
     options: JobOptions
+    stage_seconds: dict[str, float]  # of earlier attempts
     lease: Lease
 
 
@@ -114,6 +115,7 @@ class Records:
                 scan_key=keys.scan_key(row.upload_id),
                 source=row.source,
                 options=JobOptions.model_validate(row.options),
+                stage_seconds=row.progress.get("stage_seconds", {}),
                 lease=Lease(expires_at, row.cancel_requested),
             )
 

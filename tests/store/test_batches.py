@@ -66,9 +66,16 @@ def test_the_time_left_comes_from_the_rows(bench: Any) -> None:
     upload = bench.finished_upload()
     jobs = [bench.job(upload_id=upload, batch="night") for _ in range(5)]
     bench.records.claim(jobs[0], 1, "w")
-    half = Progress(stage="optimization", step=50, steps=100, steps_per_second=10.0, eta_seconds=5.0)
+    half = Progress(
+        stage="optimization",
+        step=50,
+        steps=100,
+        steps_per_second=10.0,
+        eta_seconds=5.0,
+        stage_seconds={"ingest": 1.0, "optimization": 5.0},
+    )
     bench.records.heartbeat(jobs[0], 1, half)
-    assert bench.batches.batch(bench.owner, "night").eta_seconds == 5.0 + 4 * 10.0
+    assert bench.batches.batch(bench.owner, "night").eta_seconds == 5.0 + 4 * (1.0 + 5.0 + 5.0)
     done = Progress(stage="export", stage_seconds={"ingest": 2.0, "optimization": 18.0})
     bench.records.heartbeat(jobs[0], 1, done)
     bench.records.succeed(jobs[0], 1, [])

@@ -51,6 +51,10 @@ def step_of(store: Store, job_id: str) -> int:
     return int(store.records.job(job_id).progress["step"])
 
 
+def spent(store: Store, job_id: str) -> float:
+    return float(sum(store.records.job(job_id).progress["stage_seconds"].values()))
+
+
 def test_a_job_succeeds_with_results_warnings_and_progress(
     store: Store, host: Hosts, new_job: NewJob, settings: WorkerSettings
 ) -> None:
@@ -175,13 +179,15 @@ def test_cancel_stops_within_two_seconds_and_retry_goes_on(store: Store, host: H
     thread.join()
     assert time.monotonic() - asked < 2.0
     assert store.records.job(job_id).state == JobState.canceled
-    reached = step_of(store, job_id)
+    reached, before = step_of(store, job_id), spent(store, job_id)
+    assert before > 0
     store.records.retry(job_id)
     run_attempt(host("stepping"), job_id, 2)
     state = json.loads(result(store, job_id).split("\n", 1)[1])
     assert state["chain"] == fake_engines.chain(150)
     assert state["began"][0] == 0
     assert reached <= state["began"][1] < 150, "the checkpoint of the stop itself was not used"
+    assert spent(store, job_id) >= before + 0.01 * (150 - state["began"][1]), "the first attempt's seconds were lost"
     assert list(store.blobs.list(keys.checkpoints_prefix(job_id))) == [], "checkpoints outlived the results"
 
 

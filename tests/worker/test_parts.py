@@ -145,7 +145,7 @@ class Clock:
 
 def test_the_eta_counts_only_steps_of_this_attempt() -> None:
     clock = Clock()
-    tracker = ProgressTracker(clock)
+    tracker = ProgressTracker({}, clock)
     tracker.stage(StageEvent(stage="optimization"))
     tracker.progress(ProgressEvent(step=3000, steps=4000))  # resumed
     assert tracker.view.eta_seconds is None
@@ -158,7 +158,7 @@ def test_the_eta_counts_only_steps_of_this_attempt() -> None:
 
 @given(st.lists(st.tuples(st.sampled_from(STAGES), st.integers(0, 1_000_000)), max_size=20))
 def test_reached_grows_with_stage_and_step_and_never_shrinks(moves: list[tuple[str, int]]) -> None:
-    tracker = ProgressTracker()
+    tracker = ProgressTracker({})
     best = (0, 0)
     for stage, step in moves:
         before = tracker.reached
@@ -167,6 +167,21 @@ def test_reached_grows_with_stage_and_step_and_never_shrinks(moves: list[tuple[s
         grew = (STAGES.index(stage), step) > best
         best = max(best, (STAGES.index(stage), step))
         assert (tracker.reached > before) == grew
+
+
+def test_the_seconds_of_stages_are_those_of_all_attempts() -> None:
+    clock = Clock()
+    tracker = ProgressTracker({"ingest": 4.0, "optimization": 100.0}, clock)
+    assert tracker.view.stage_seconds == {"ingest": 4.0, "optimization": 100.0}, "nothing is lost before the first word"
+    tracker.stage(StageEvent(stage="atlas"))
+    tracker.stage(StageEvent(stage="atlas", seconds=2.0))
+    tracker.stage(StageEvent(stage="optimization"))
+    for _ in range(3):
+        clock.now += 10.0
+        tracker.progress(ProgressEvent(step=3000, steps=4000))
+    assert tracker.view.stage_seconds == {"ingest": 4.0, "atlas": 2.0, "optimization": 130.0}, "also if it dies now"
+    tracker.stage(StageEvent(stage="optimization", seconds=31.0))
+    assert tracker.view.stage_seconds["optimization"] == 131.0
 
 
 class FakeRecords:

@@ -229,7 +229,7 @@ class Attempt:
         """Everything the runner says, in order. -> how it said that it ended, None if it died."""
         if self._keeper.ending:  # asked before there was anybody to ask
             self._on_ending(Ending.cancel if self._canceled else self._keeper.ending)
-        tracker = ProgressTracker()
+        tracker = ProgressTracker(self._claim.stage_seconds)
         for event in child.events():
             match event:
                 case StageEvent():

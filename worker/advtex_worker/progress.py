@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from advtex_contract.jobs import Progress
 from advtex_engine.monitor import STAGES
@@ -13,19 +13,24 @@ STAGE_WEIGHT = 10_000_000  # more than any step count
 
 
 class ProgressTracker:
-    """Folds stage and progress events into one view. Not thread-safe: views are immutable and handed over whole."""
+    """Folds stage and progress events into one view. Not thread-safe: views are immutable and handed over whole.
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self.view = Progress()
+    earlier: seconds that the attempts before spent in stages; what this one spends is added.
+    """
+
+    def __init__(self, earlier: Mapping[str, float], clock: Callable[[], float] = time.monotonic) -> None:
+        self.view = Progress(stage_seconds=dict(earlier))
         self.reached = 0
         self._clock = clock
         self._first: tuple[int, float] | None = None
+        self._before = 0.0  # seconds in the stage until it began this time
+        self._began = 0.0
 
     def stage(self, event: StageEvent) -> None:
         if event.seconds is not None:
-            spent = self.view.stage_seconds | {event.stage: round(event.seconds, 3)}
-            self.view = self.view.model_copy(update={"stage_seconds": spent})
+            self.view = self.view.model_copy(update={"stage_seconds": self._spent(event.stage, event.seconds)})
             return
+        self._before, self._began = self.view.stage_seconds.get(event.stage, 0.0), self._clock()
         self._first = None
         self.view = self.view.model_copy(update={"stage": event.stage, "steps_per_second": None, "eta_seconds": None})
         self._reach(event.stage, 0)
@@ -42,11 +47,15 @@ class ProgressTracker:
             "step": event.step,
             "steps": event.steps,
             "losses": event.losses,
+            "stage_seconds": self._spent(self.view.stage, now - self._began),
             "steps_per_second": rate,
             "eta_seconds": (event.steps - event.step) / rate if rate else None,
         }
         self.view = self.view.model_copy(update=update)
         self._reach(self.view.stage, event.step)
+
+    def _spent(self, stage: str, seconds: float) -> dict[str, float]:
+        return self.view.stage_seconds | {stage: round(self._before + seconds, 3)}
 
     def _reach(self, stage: str, step: int) -> None:
         index = STAGES.index(stage) if stage in STAGES else 0

@@ -18,7 +18,12 @@ class ServerSettings(StoreSettings):
     reconcile_seconds: float = Field(default=10.0, gt=0, description="between looks at leases and old blobs")
     sweep_seconds: float = Field(default=3600.0, gt=0, description="between looks for blobs that no row refers to")
     queue_depth: int = Field(default=1, gt=0, description="attempts that wait in Redis, per worker")
-    auth_failures_per_minute: int = Field(default=60, gt=0, description="wrong keys that one address may send")
+    auth_failures_per_minute: int = Field(
+        default=60,
+        gt=0,
+        description="wrong keys that one address may send to one server process; which proxies are believed about "
+        "addresses is said by FORWARDED_ALLOW_IPS, uvicorn's own variable",
+    )
     webhook_allow_http: bool = Field(default=False, description="webhooks may go to http:// addresses")
     webhook_networks: tuple[IPvAnyNetwork, ...] = Field(
         default=(), description="networks that are not public and that webhooks may go to, as a JSON list"

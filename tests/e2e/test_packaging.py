@@ -172,6 +172,17 @@ class TestCompose:
             assert getattr(read["server"], field) == getattr(read["worker"], field)
         assert read["server"].database == "postgresql+psycopg://advtex:POSTGRES_PASSWORD-secret@postgres/advtex"
 
+    def test_server_and_workers_see_the_same_scans(self) -> None:
+        mounts, roots = set(), set()
+        for name in SETTINGS:
+            service = COMPOSE["services"][name]
+            mounts |= {entry for entry in service["volumes"] if ":/scans:" in entry}
+            assert sum(":/scans:" in entry for entry in service["volumes"]) == 1, name
+            roots.add(service["environment"]["ADVTEX_REFERENCE_ROOTS"])
+        assert mounts == {"${ADVTEX_SCANS:-./scans}:/scans:ro"}
+        (root,) = roots
+        assert re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", root) == "file:///scans"
+
     def test_secrets_are_required_and_never_written_down(self) -> None:
         text = (ROOT / "compose.yaml").read_text()
         used = re.findall(r"\$\{(\w+_PASSWORD)([^}]*)\}", re.sub(r"^ *#.*", "", text, flags=re.MULTILINE))

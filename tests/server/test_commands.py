@@ -211,6 +211,37 @@ def test_keys_and_doctor(tmp_path: Path, run: Callable[..., Result]) -> None:
     assert run(tmp_path / "empty", "doctor").exit_code == 1
 
 
+def test_keys_are_limited_and_rotated(tmp_path: Path, run: Callable[..., Result]) -> None:
+    def rows() -> list[dict[str, Any]]:
+        return [json.loads(line) for line in run(tmp_path, "keys", "list").stdout.splitlines()]
+
+    limits = ("--max-active-jobs", "2", "--max-bytes", "1000")
+    key = run(tmp_path, "keys", "create", "ada", "--owner", "team", *limits).stdout.strip()
+    (row,) = rows()
+    assert (row["owner"], row["max_active_jobs"], row["max_bytes"]) == ("team", 2, 1000)
+    assert (row["active_jobs"], row["bytes"]) == (0, 0)
+    assert run(tmp_path, "keys", "limit", row["id"], "--max-active-jobs", "5").exit_code == 0
+    assert [(r["max_active_jobs"], r["max_bytes"]) for r in rows()] == [(5, None)]
+
+    now = time.time()
+    new = run(tmp_path, "keys", "rotate", row["id"], "--keep-hours", "2").stdout.strip()
+    assert new.startswith("adv_")
+    assert new != key
+    old, fresh = rows()
+    assert abs(old["expires_at"] - now - 7200) < 60
+    assert (fresh["id"], fresh["expires_at"]) == (new.split("_")[1], None)
+    assert all(fresh[name] == row[name] for name in ("name", "owner", "scopes"))
+    assert (fresh["max_active_jobs"], fresh["max_bytes"]) == (5, None)
+    run(tmp_path, "keys", "rotate", fresh["id"])
+    assert rows()[1]["expires_at"] <= time.time()
+
+    for refused in (("rotate", "none"), ("limit", "none", "--max-bytes", "1")):
+        failed = run(tmp_path, "keys", *refused)
+        assert failed.exit_code == 1
+        assert "there is no key none" in failed.stderr
+    assert run(tmp_path, "keys", "create", "--max-bytes", "-1").exit_code == 2
+
+
 def test_without_any_redis_the_message_helps(monkeypatch: pytest.MonkeyPatch) -> None:
     assert os.access(redis_binary(), os.X_OK)
     monkeypatch.setattr(embedded.importlib.util, "find_spec", lambda _: None)

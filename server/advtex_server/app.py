@@ -9,7 +9,6 @@ from importlib.metadata import PackageNotFoundError, version
 
 from fastapi import FastAPI
 
-from advtex_contract.errors import ErrorBody
 from advtex_server import errors
 from advtex_server.access import AccessMiddleware
 from advtex_server.bodies import OpenBodies
@@ -18,6 +17,7 @@ from advtex_server.dispatch import Dispatcher
 from advtex_server.doorkeeper import Doorkeeper
 from advtex_server.intake import Intake
 from advtex_server.metrics import Metrics, MetricsMiddleware
+from advtex_server.refusal import ANYWHERE
 from advtex_server.routes import batches, health, jobs, uploads, webhooks
 from advtex_server.service import Service
 from advtex_server.settings import ServerSettings
@@ -54,10 +54,7 @@ def create_app(settings: ServerSettings) -> FastAPI:
         version=_version(),
         summary="Sharp textures from RGB-D scans",
         lifespan=lifespan,
-        responses={
-            "4XX": {"model": ErrorBody, "description": "refused"},
-            "5XX": {"model": ErrorBody, "description": "not possible now"},
-        },
+        responses=ANYWHERE,
         docs_url=None,  # their pages load scripts from elsewhere
         redoc_url=None,
     )

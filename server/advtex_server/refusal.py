@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from advtex_contract.errors import ErrorBody, ErrorCode, ErrorDetail
 
@@ -27,6 +28,15 @@ STATUS: Mapping[ErrorCode, int] = {
     ErrorCode.unavailable: 503,
     ErrorCode.internal: 500,
 }
+SPECIAL: Mapping[int, str] = {
+    408: "nothing came for too long",
+    411: "there is no Content-Length",
+    415: "another Content-Type is needed",
+    416: "the range is beyond the end",
+    422: "a value that is not accepted",
+    460: "the bytes do not fit their Upload-Checksum",
+}
+"""Statuses that are not the usual one of their code, and what they say."""
 
 
 REMEDIES: Mapping[ErrorCode, tuple[str, str]] = {
@@ -58,3 +68,16 @@ class ApiError(Exception):
         self.body = ErrorBody(code=code, message=message, details=details or [])
         self.status = status or STATUS[code]
         self.headers = dict(headers or {})
+
+
+def refuses(*reasons: ErrorCode | int) -> dict[int | str, dict[str, Any]]:
+    """Refusals as a route's description has them: codes, and statuses of `SPECIAL`."""
+    found: dict[int, list[str]] = {}
+    for reason in reasons:
+        status = STATUS[reason] if isinstance(reason, ErrorCode) else reason
+        found.setdefault(status, []).append(reason.value if isinstance(reason, ErrorCode) else SPECIAL[reason])
+    return {status: {"model": ErrorBody, "description": "; ".join(said)} for status, said in found.items()}
+
+
+ANYWHERE = refuses(ErrorCode.too_large, ErrorCode.internal, ErrorCode.unavailable)
+WITH_KEY = refuses(ErrorCode.unauthorized, ErrorCode.forbidden, ErrorCode.rate_limited)

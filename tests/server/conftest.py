@@ -13,6 +13,7 @@ import httpx
 import pytest
 import structlog
 import uvicorn
+from fastapi.routing import APIRoute
 
 from advtex_server.app import create_app
 from advtex_server.settings import ServerSettings
@@ -51,7 +52,16 @@ class Live:
 
     def client(self, key: str | None) -> httpx.Client:
         headers = {} if key is None else {"Authorization": f"Bearer {key}"}
-        return httpx.Client(base_url=self.url, headers=headers, timeout=20)
+        hooks = {"response": [self.check_described]}
+        return httpx.Client(base_url=self.url, headers=headers, timeout=20, event_hooks=hooks)
+
+    def check_described(self, response: httpx.Response) -> None:
+        """Whatever a test provokes: the description has the status."""
+        method, path = response.request.method, response.request.url.path
+        for route in self.app.routes:
+            if isinstance(route, APIRoute) and method in route.methods and route.path_regex.match(path):
+                operation = self.app.openapi()["paths"][route.path_format][method.lower()]
+                assert str(response.status_code) in operation["responses"], (method, path, response.status_code)
 
     @property
     def store(self) -> Any:

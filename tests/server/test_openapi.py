@@ -26,6 +26,7 @@ from advtex_server.app import create_app
 from advtex_server.settings import ServerSettings
 
 KEPT = Path(__file__).parent / "openapi.json"
+RUNS = 8
 
 
 def described() -> dict[str, Any]:
@@ -48,8 +49,13 @@ def test_the_description_is_valid_and_every_call_is_described() -> None:
     for path, methods in description["paths"].items():
         for method, operation in methods.items():
             assert operation["summary"], (method, path)
-            assert "4XX" in operation["responses"]
-            assert "422" not in operation["responses"], "validation errors have the one body too"
+            for status, answer in operation["responses"].items():
+                assert status.isdigit(), (method, path, status)
+                if int(status) >= 400 and path != "/readyz":
+                    schema = answer["content"]["application/json"]["schema"]
+                    assert schema["$ref"].endswith("/ErrorBody"), (method, path, status)
+            missing = {"401", "403", "429", "500", "503"} - set(operation["responses"])
+            assert not (missing and path.startswith("/v1/")), (method, path, missing)
             assert ("security" in operation) == path.startswith("/v1/"), (method, path)
 
 
@@ -115,17 +121,20 @@ def test_sequences_of_calls_keep_to_the_description(live: Any) -> None:
                 failures.append(error)
                 raise
 
-    # schemathesis chooses links by true randomness, which hypothesis now and then notices and complains of
-    with contextlib.suppress(FlakyStrategyDefinition):
-        run_state_machine_as_test(
-            Calls,
-            settings=settings(
-                max_examples=30,
-                stateful_step_count=12,
-                deadline=None,
-                phases=[Phase.explicit, Phase.generate],
-                suppress_health_check=list(HealthCheck),
-            ),
-        )
+    thorough = settings(
+        max_examples=30,
+        stateful_step_count=12,
+        deadline=None,
+        phases=[Phase.explicit, Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+    # schemathesis chooses links by true randomness; where hypothesis notices, the run ends early and does not count
+    for _ in range(RUNS):
+        with contextlib.suppress(FlakyStrategyDefinition):
+            run_state_machine_as_test(Calls, settings=thorough)
+            break
+        assert not failures
+    else:
+        pytest.fail(f"none of {RUNS} runs came to its end")
     assert not failures
-    assert {"GET /v1/jobs/{job_id}", "DELETE /v1/jobs/{job_id}", "GET /v1/batches/{batch_id}"} & worked
+    assert {"GET /v1/jobs/{job_id}", "DELETE /v1/jobs/{job_id}", "GET /v1/batches/{batch_id}"} <= worked

@@ -6,15 +6,18 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path, Query
 
+from advtex_contract.errors import ErrorCode
 from advtex_contract.jobs import BatchPage, BatchView
 from advtex_server.deps import Reader, TheService, Writer
+from advtex_server.refusal import WITH_KEY, refuses
 
-router = APIRouter(prefix="/v1/batches", tags=["batches"])
+router = APIRouter(prefix="/v1/batches", tags=["batches"], responses=WITH_KEY)
 
 BatchName = Annotated[str, Path(max_length=100)]
+OF_A_BATCH = refuses(ErrorCode.not_found, 422)
 
 
-@router.get("")
+@router.get("", responses=refuses(422))
 def list_batches(
     caller: Reader,
     service: TheService,
@@ -25,19 +28,21 @@ def list_batches(
     return service.batches.page(caller.owner, cursor, limit)
 
 
-@router.get("/{batch_id}")
+@router.get("/{batch_id}", responses=OF_A_BATCH)
 def get_batch(batch_id: BatchName, caller: Reader, service: TheService) -> BatchView:
     """How many jobs are in which state, and how long the rest takes at the step rates that were measured."""
     return service.batches.view(caller.owner, batch_id)
 
 
-@router.post("/{batch_id}/cancel")
+@router.post("/{batch_id}/cancel", responses=OF_A_BATCH)
 def cancel_batch(batch_id: BatchName, caller: Writer, service: TheService) -> BatchView:
     """Cancel every job that has not ended."""
     return service.batches.cancel(caller.owner, batch_id)
 
 
-@router.post("/{batch_id}/retry-failed")
+@router.post(
+    "/{batch_id}/retry-failed", responses=OF_A_BATCH | refuses(ErrorCode.rate_limited, ErrorCode.quota_exceeded)
+)
 def retry_batch(batch_id: BatchName, caller: Writer, service: TheService) -> BatchView:
     """Queue every failed job again; each goes on from its checkpoint."""
     return service.batches.retry_failed(caller, batch_id)

@@ -7,16 +7,18 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
+from advtex_contract.errors import ErrorCode
 from advtex_contract.jobs import BatchId, JobPage, JobSpec, JobState, JobView, Label
 from advtex_server.deps import Reader, TheService, Writer
 from advtex_server.events import stream_events
 from advtex_server.ranges import chosen_range
+from advtex_server.refusal import WITH_KEY, refuses
 from advtex_store.submissions import JobFilter
 
-router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=WITH_KEY)
 
 JobId = Annotated[str, Path(max_length=64)]
-
+OF_A_JOB = refuses(ErrorCode.not_found, 422)
 
 EVENT = {  # before OpenAPI 3.2 a stream's schema is that of each event
     "type": "object",
@@ -29,7 +31,25 @@ EVENT = {  # before OpenAPI 3.2 a stream's schema is that of each event
 }
 
 
-@router.post("", status_code=201, responses={200: {"model": JobView, "description": "the key's job, made before"}})
+@router.post(
+    "",
+    status_code=201,
+    responses=refuses(
+        ErrorCode.bad_request,
+        ErrorCode.not_found,
+        ErrorCode.conflict,
+        ErrorCode.idempotency_in_flight,
+        ErrorCode.not_ready,
+        422,
+        ErrorCode.invalid_options,
+        ErrorCode.invalid_source,
+        ErrorCode.idempotency_mismatch,
+        ErrorCode.rate_limited,
+        ErrorCode.quota_exceeded,
+        ErrorCode.insufficient_storage,
+    )
+    | {200: {"model": JobView, "description": "the key's job, made before"}},
+)
 def create_job(
     spec: JobSpec,
     caller: Writer,
@@ -45,7 +65,7 @@ def create_job(
     return view
 
 
-@router.get("")
+@router.get("", responses=refuses(422))
 def list_jobs(
     caller: Reader,
     service: TheService,
@@ -59,25 +79,28 @@ def list_jobs(
     return service.jobs(caller.owner, JobFilter(state, label, batch), cursor, limit)
 
 
-@router.get("/{job_id}")
+@router.get("/{job_id}", responses=OF_A_JOB)
 def get_job(job_id: JobId, caller: Reader, service: TheService) -> JobView:
     """One job."""
     return service.job(caller.owner, job_id)
 
 
-@router.post("/{job_id}/cancel")
+@router.post("/{job_id}/cancel", responses=OF_A_JOB | refuses(ErrorCode.conflict))
 def cancel_job(job_id: JobId, caller: Writer, service: TheService) -> JobView:
     """A waiting job ends at once; a running one is stopped with a checkpoint."""
     return service.cancel(caller.owner, job_id)
 
 
-@router.post("/{job_id}/retry")
+@router.post(
+    "/{job_id}/retry",
+    responses=OF_A_JOB | refuses(ErrorCode.conflict, ErrorCode.rate_limited, ErrorCode.quota_exceeded),
+)
 def retry_job(job_id: JobId, caller: Writer, service: TheService) -> JobView:
     """A failed or canceled job goes on from its checkpoint."""
     return service.retry(caller, job_id)
 
 
-@router.delete("/{job_id}", status_code=204)
+@router.delete("/{job_id}", status_code=204, responses=OF_A_JOB | refuses(ErrorCode.conflict))
 def delete_job(job_id: JobId, caller: Writer, service: TheService) -> Response:
     """Remove an ended job with its results."""
     service.delete(caller.owner, job_id)
@@ -87,7 +110,7 @@ def delete_job(job_id: JobId, caller: Writer, service: TheService) -> Response:
 @router.get(
     "/{job_id}/events",
     response_class=StreamingResponse,
-    responses={200: {"content": {"text/event-stream": {"schema": EVENT}}}},
+    responses=OF_A_JOB | {200: {"content": {"text/event-stream": {"schema": EVENT}}}},
 )
 def job_events(
     job_id: JobId,
@@ -111,7 +134,9 @@ def job_events(
 @router.get(
     "/{job_id}/results/{name:path}",
     response_class=StreamingResponse,
-    responses={
+    responses=OF_A_JOB
+    | refuses(ErrorCode.not_ready, 416)
+    | {
         200: {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}},
         206: {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}},
         304: {"description": "unchanged"},

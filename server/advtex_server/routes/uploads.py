@@ -13,10 +13,10 @@ from advtex_server import tus
 from advtex_server.bodies import OpenBodies, receive
 from advtex_server.deps import Reader, TheIntake, TheService, Writer, reader
 from advtex_server.intake import Checksum, Intake, upload_view
-from advtex_server.refusal import ApiError
+from advtex_server.refusal import WITH_KEY, ApiError, refuses
 from advtex_store.models import UploadRow
 
-router = APIRouter(prefix="/v1", tags=["uploads"])
+router = APIRouter(prefix="/v1", tags=["uploads"], responses=WITH_KEY)
 
 PATIENCE = 30.0  # seconds that a request waits for an older one of the same upload to be kept
 HEAD_PATIENCE = 0.3  # a client that asks where to go on has lost its line already
@@ -24,6 +24,18 @@ HEAD_PATIENCE = 0.3  # a client that asks where to go on has lost its line alrea
 UploadId = Annotated[str, Path(max_length=64)]
 TusVersion = Annotated[str | None, Header(description="1.0.0; without it this is a plain upload")]
 TusChecksum = Annotated[str | None, Header(description="tus: algorithm and base64 digest of this body")]
+OTHER_TUS = refuses(ErrorCode.precondition_failed)
+OF_AN_UPLOAD = OTHER_TUS | refuses(ErrorCode.not_found, 422)
+RECEIVING = OF_AN_UPLOAD | refuses(
+    ErrorCode.bad_request,
+    ErrorCode.conflict,
+    ErrorCode.too_large,
+    ErrorCode.checksum_mismatch,
+    ErrorCode.insufficient_storage,
+    408,
+    422,
+    460,
+)
 BINARY = {"schema": {"type": "string", "format": "binary"}}
 
 
@@ -37,7 +49,9 @@ TEXTURE = {"operationId": "create_job_v1_jobs_post", "requestBody": {"upload_id"
 OFFSET = _headers(Upload_Offset="bytes that are durable", Upload_Expires="when an unfinished upload is forgotten")
 
 
-@router.options("/uploads", status_code=204, dependencies=[Depends(reader)], response_class=Response)
+@router.options(
+    "/uploads", status_code=204, dependencies=[Depends(reader)], response_class=Response, responses=OTHER_TUS
+)
 async def upload_features(service: TheService) -> Response:
     """What the server speaks (tus)."""
     headers = {
@@ -56,7 +70,9 @@ async def upload_features(service: TheService) -> Response:
     openapi_extra={
         "requestBody": {"required": False, "content": {"application/zip": BINARY, tus.OFFSET_STREAM: BINARY}}
     },
-    responses={201: {"headers": _headers(Location="the upload") | OFFSET, "links": {"texture": TEXTURE}}},
+    responses={201: {"headers": _headers(Location="the upload") | OFFSET, "links": {"texture": TEXTURE}}}
+    | RECEIVING
+    | refuses(ErrorCode.too_large, ErrorCode.quota_exceeded, 411),
 )
 async def create_upload(
     request: Request,
@@ -95,7 +111,7 @@ async def create_upload(
     return view
 
 
-@router.get("/uploads")
+@router.get("/uploads", responses=OTHER_TUS | refuses(422))
 def find_uploads(
     caller: Reader,
     intake: TheIntake,
@@ -105,14 +121,16 @@ def find_uploads(
     return UploadList(uploads=intake.find(caller.owner, sha256))
 
 
-@router.get("/uploads/{upload_id}")
+@router.get("/uploads/{upload_id}", responses=OF_AN_UPLOAD)
 def get_upload(upload_id: UploadId, caller: Reader, intake: TheIntake) -> UploadView:
     """An upload; complete once `sha256` is set."""
     return intake.view(caller.owner, upload_id)
 
 
 @router.head(
-    "/uploads/{upload_id}", response_class=Response, responses={200: {"headers": OFFSET, "description": "its offset"}}
+    "/uploads/{upload_id}",
+    response_class=Response,
+    responses={200: {"headers": OFFSET, "description": "its offset"}} | OF_AN_UPLOAD | refuses(ErrorCode.conflict),
 )
 async def head_upload(
     upload_id: UploadId, caller: Writer, intake: TheIntake, request: Request, tus_resumable: TusVersion = None
@@ -135,7 +153,7 @@ async def head_upload(
     status_code=204,
     response_class=Response,
     openapi_extra={"requestBody": {"required": True, "content": {tus.OFFSET_STREAM: BINARY}}},
-    responses={204: {"headers": OFFSET, "description": "the bytes are durable"}},
+    responses={204: {"headers": OFFSET, "description": "the bytes are durable"}} | RECEIVING | refuses(415),
 )
 async def patch_upload(
     upload_id: UploadId,
@@ -158,7 +176,7 @@ async def patch_upload(
     return Response(status_code=204, headers=_progress(view))
 
 
-@router.delete("/uploads/{upload_id}", status_code=204)
+@router.delete("/uploads/{upload_id}", status_code=204, responses=OF_AN_UPLOAD | refuses(ErrorCode.conflict))
 async def delete_upload(upload_id: UploadId, caller: Writer, intake: TheIntake, request: Request) -> Response:
     """Remove an upload that no job needs."""
     await run_in_threadpool(intake.view, caller.owner, upload_id)

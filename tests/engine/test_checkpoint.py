@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import resource
+import tempfile
 import time
 from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from advtex_engine.checkpoint import MAX_SHARE, CheckpointTimer, WorkFolder
+from advtex_engine.checkpoint import MAX_SHARE, Checkpoints, WorkFolder
 from advtex_engine.monitor import Monitor
 
 
@@ -78,22 +81,97 @@ def test_clear_removes_what_an_earlier_run_left(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_checkpoints_come_every_so_many_seconds_and_rarer_when_writing_is_slow(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = 1000.0
-    monkeypatch.setattr(time, "monotonic", lambda: now)
-    timer = CheckpointTimer(30.0)
-    assert not timer.due()
-    now = 1030.0
-    assert timer.due()
-    now = 1030.1  # a tenth of a second to write: the interval stays
-    timer.wrote(1030.0)
-    now = 1060.0
-    assert not timer.due()
-    now = 1060.2
-    assert timer.due()
-    now = 1065.2  # five seconds to write
-    timer.wrote(1060.2)
-    now = 1065.2 + 5 / MAX_SHARE - 1
-    assert not timer.due()
-    now += 2
-    assert timer.due()
+class Clock(Monitor):
+    """Stands in for time.monotonic; whatever is saved takes `cost` seconds."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now, self.cost = 1000.0, 0.0
+        monkeypatch.setattr(time, "monotonic", lambda: self.now)
+
+    def checkpointed(self, files: tuple[Path, ...]) -> None:
+        self.now += self.cost
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    return Clock(monkeypatch)
+
+
+@pytest.fixture
+def folder(clock: Clock, tmp_path: Path) -> WorkFolder:
+    return WorkFolder(tmp_path, "run", clock)
+
+
+def test_checkpoints_come_every_so_many_seconds(clock: Clock, folder: WorkFolder) -> None:
+    checkpoints = Checkpoints(folder, 30.0)
+    clock.cost = 0.1
+    for _ in range(3):
+        clock.now += 29.9
+        assert not checkpoints.due()
+        clock.now += 0.1
+        assert checkpoints.due()
+        checkpoints.save({})
+
+
+def test_checkpoints_that_take_long_come_rarer(clock: Clock, folder: WorkFolder) -> None:
+    checkpoints = Checkpoints(folder, 30.0)
+    clock.now += 30
+    assert checkpoints.due()
+    clock.cost = 5.0
+    checkpoints.save({})
+    clock.now = folder.started + 5 / MAX_SHARE - 1
+    assert not checkpoints.due()
+    clock.now += 1
+    assert checkpoints.due()
+    checkpoints.save({})
+    clock.now = folder.started + 10 / MAX_SHARE - 1
+    assert not checkpoints.due()
+    clock.now += 1
+    assert checkpoints.due()
+
+
+def test_stage_caches_that_took_long_put_the_first_checkpoint_off(clock: Clock, folder: WorkFolder) -> None:
+    clock.cost = 2.0
+    folder.save("view_maps", {})
+    checkpoints = Checkpoints(folder, 30.0)
+    clock.now = folder.started + 2 / MAX_SHARE - 1
+    assert not checkpoints.due()
+    clock.now += 1
+    assert checkpoints.due()
+
+
+@settings(max_examples=60)
+@given(st.floats(0, 20), st.floats(0.01, 30), st.floats(0.01, 3))
+def test_checkpoints_no_dearer_than_the_caches_take_two_percent(caches: float, cost: float, step: float) -> None:
+    """Whenever one was just written, whatever the stages before took."""
+    with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as path:
+        clock = Clock(patch)
+        folder = WorkFolder(Path(path), "run", clock)
+        clock.cost = max(caches, cost)
+        folder.save("view_maps", {})
+        clock.cost = cost
+        checkpoints = Checkpoints(folder, 1.0)
+        for _ in range(3):
+            clock.now = max(clock.now, folder.started + folder.seconds / MAX_SHARE - step)
+            while not checkpoints.due():
+                clock.now += step
+            checkpoints.save({})
+            assert folder.seconds <= 2 * MAX_SHARE * (clock.now - folder.started)
+
+
+def test_a_checkpoint_knows_what_all_attempts_have_spent(clock: Clock, folder: WorkFolder) -> None:
+    checkpoints = Checkpoints(folder, 30.0)
+    clock.now += 40
+    checkpoints.save({"step": 1})
+    clock.now += 1000
+    again = WorkFolder(folder.path, "run", clock)
+    resumed = Checkpoints(again, 30.0)
+    loaded = resumed.load()
+    assert loaded is not None
+    assert loaded["step"] == 1
+    assert again.earlier_seconds == 40
+    clock.now += 2
+    resumed.save({"step": 2})
+    last = WorkFolder(folder.path, "run", clock)
+    Checkpoints(last, 30.0).load()
+    assert last.earlier_seconds == 42

@@ -23,6 +23,7 @@ from advtex_engine.report import Stages, WarningKeeper
 from advtex_engine.synthesize import synthesize
 
 STEPS = 24
+CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +40,7 @@ class Recorder(Monitor):
     def __init__(self, stop_at: int | None = None) -> None:
         self.stop_at, self.step = stop_at, 0
         self.stages: list[str] = []
+        self.seconds: dict[str, float] = {}
         self.steps: list[int] = []
         self.files: set[str] = set()
         self.problems: list[Problem] = []
@@ -47,6 +49,7 @@ class Recorder(Monitor):
         assert seconds >= 0
         assert peak_memory_bytes > 2**20
         self.stages.append(stage)
+        self.seconds[stage] = seconds
 
     def progress(self, step: int, steps: int, losses: Mapping[str, float]) -> None:
         assert steps == STEPS
@@ -95,6 +98,7 @@ def test_a_stopped_run_resumes_to_the_same_bytes_without_redoing_earlier_stages(
 ) -> None:
     with pytest.raises(Stopped, match="step 10 of 24"):
         texture_scan(scan, tmp_path, CONFIG, work=tmp_path / "work", monitor=Recorder(stop_at=10))
+    first = torch.load(tmp_path / "work" / "checkpoint.pt")["seconds"]
     again = Recorder()
     texture_scan(scan, tmp_path, CONFIG, work=tmp_path / "work", resume=True, monitor=again)
     assert again.steps[0] == 11
@@ -104,6 +108,9 @@ def test_a_stopped_run_resumes_to_the_same_bytes_without_redoing_earlier_stages(
     report = json.loads((tmp_path / "report.json").read_text())
     resumed = [stage["stage"] for stage in report["stages"] if stage["resumed"]]
     assert resumed == ["ingest", "geometry", "refinement", "atlas"]
+    (optimization,) = [stage["seconds"] for stage in report["stages"] if stage["stage"] == "optimization"]
+    assert first > 0.01
+    assert optimization == pytest.approx(first + again.seconds["optimization"], abs=0.002)
     assert [point["step"] for point in report["losses"]] == list(range(1, STEPS + 1))
 
 
@@ -121,7 +128,7 @@ def test_without_resume_and_with_other_options_the_work_folder_is_not_used(
 
 @pytest.mark.slow
 def test_a_killed_run_resumes_bit_identical(scan: Path, tmp_path: Path) -> None:
-    arguments = [sys.executable, "-m", "advtex_engine", "texture", str(scan), "--preset", "standard", "--steps", "60"]
+    arguments = [sys.executable, "-m", "advtex_engine", "texture", str(scan), "--preset", "standard", "--steps", "200"]
     arguments += ["--face-budget", "4000", "--device", "cpu"]
     environment = {**os.environ, "OMP_NUM_THREADS": "2"}
     subprocess.run([*arguments, "-o", str(tmp_path / "whole")], check=True, env=environment, capture_output=True)
@@ -134,7 +141,7 @@ def test_a_killed_run_resumes_bit_identical(scan: Path, tmp_path: Path) -> None:
     )
     assert child.stderr is not None
     for line in child.stderr:
-        if "step 30/" in line:
+        if "step " in line and (killed / "work" / "checkpoint.pt").exists():
             child.send_signal(signal.SIGKILL)
             break
     assert child.wait() == -signal.SIGKILL
@@ -174,16 +181,87 @@ def test_a_terminated_run_leaves_a_checkpoint_and_its_exit_code_says_so(scan: Pa
     assert (tmp_path / "work" / "checkpoint.pt").exists()
 
 
+@pytest.mark.slow
+def test_saving_takes_little_of_a_small_run(scan: Path, tmp_path: Path) -> None:
+    """Checkpoints come as often as their share of the time lets them: nothing else bounds them here."""
+    config = TextureConfig(preset="preview", steps=300, face_budget=4000, device="cpu", checkpoint_seconds=0.01)
+    recorder = Checkpointed()
+    report = texture_scan(scan, tmp_path, config, work=tmp_path / "work", monitor=recorder).report
+    assert recorder.checkpoints > 0
+    assert report["saving_seconds"] <= 0.02 * sum(stage["seconds"] for stage in report["stages"])
+
+
+class Checkpointed(Monitor):
+    """Counts checkpoints."""
+
+    checkpoints = 0
+
+    def checkpointed(self, files: tuple[Path, ...]) -> None:
+        self.checkpoints += sum(file.name == "checkpoint.pt" for file in files)
+
+
+def test_a_stage_that_was_interrupted_counts_what_was_spent_on_it_before(tmp_path: Path) -> None:
+    for expected in (0.05, 0.1):
+        keeper = WarningKeeper(Monitor())
+        stages = Stages(keeper, WorkFolder(tmp_path, "run", keeper), CPU)
+        with stages.run("view_maps"):
+            time.sleep(0.05)
+        stages.save()
+        assert stages.records[0]["seconds"] >= expected
+
+
+def memory_of_two_stages(folder: Path) -> list[int]:
+    """Peaks of a stage that takes 256 MiB and of one after it that takes nothing."""
+    keeper = WarningKeeper(Monitor())
+    stages = Stages(keeper, WorkFolder(folder, "run", keeper), CPU)
+    with stages.run("atlas"):
+        torch.ones(64 << 20)
+    with stages.run("view_maps"):
+        pass
+    assert [record["peak_device_memory_bytes"] for record in stages.records] == [None, None]
+    return [record["peak_memory_bytes"] for record in stages.records]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux can begin a peak anew")
+def test_each_stage_has_its_own_peak_memory(tmp_path: Path) -> None:
+    large, small = memory_of_two_stages(tmp_path)
+    assert large - small > 200 << 20
+
+
+def test_where_peaks_cannot_begin_anew_they_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def forbidden(path: Path, _content: str) -> int:
+        raise PermissionError(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_text", forbidden)
+        large, small = memory_of_two_stages(tmp_path)
+    assert small >= large
+
+
+def test_a_gpus_peak_is_that_of_the_stage(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """What CUDA's allocator is asked, and of which device."""
+    device = torch.device("cuda:1")
+    peaks = {device: 0}
+    monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", lambda of: peaks.update({of: 0}))
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda of: peaks[of])
+    keeper = WarningKeeper(Monitor())
+    stages = Stages(keeper, WorkFolder(tmp_path, "run", keeper), device)
+    for stage, taken in (("view_maps", 700), ("optimization", 500)):
+        with stages.run(stage):
+            peaks[device] = max(peaks[device], taken)
+    assert [record["peak_device_memory_bytes"] for record in stages.records] == [700, 500]
+
+
 def test_a_resumed_run_keeps_the_warnings_of_stages_that_it_takes_over(tmp_path: Path) -> None:
     problem = Problem("odd", "mesh", "is odd", "look at it")
     first = WarningKeeper(Monitor())
-    stages = Stages(first, WorkFolder(tmp_path, "run", first))
+    stages = Stages(first, WorkFolder(tmp_path, "run", first), CPU)
     for stage in ("ingest", "atlas"):
         with stages.run(stage):
             first.warning(problem)
     stages.save()
     again = WarningKeeper(Monitor())
-    resumed = Stages(again, WorkFolder(tmp_path, "run", again))
+    resumed = Stages(again, WorkFolder(tmp_path, "run", again), CPU)
     resumed.restore("ingest")
     assert [warning["stage"] for warning in again.warnings] == ["ingest"]
     assert [record["stage"] for record in resumed.records] == ["ingest"]

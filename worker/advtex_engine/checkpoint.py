@@ -17,7 +17,9 @@ from advtex_engine.files import atomic_file
 from advtex_engine.monitor import Monitor
 
 CHECKPOINT = "checkpoint"
-MAX_SHARE = 0.01  # of the run time goes into checkpoints; the promise is 2 %
+MAX_SHARE = 0.01
+"""A checkpoint is due while saving took less than this of the run's time. It costs about as much as all that was saved
+before it at most, so that afterwards the share is within twice this: the promise of 2 %."""
 
 
 class WorkFolder:
@@ -25,12 +27,14 @@ class WorkFolder:
 
     save: atomic and durable, then reported to the monitor; OSError when the disk is full. load: None when absent,
     unreadable or of another run.
-    seconds: spent in `save` so far.
+    seconds: spent in `save` so far. started: when this attempt began (time.monotonic). earlier_seconds: what attempts
+    before it spent on the optimization, as far as the checkpoint that was loaded goes.
     """
 
     def __init__(self, path: Path, fingerprint: str, monitor: Monitor) -> None:
         self.path, self.fingerprint, self.monitor = path, fingerprint, monitor
-        self.seconds = 0.0
+        self.seconds = self.earlier_seconds = 0.0
+        self.started = time.monotonic()
         path.mkdir(parents=True, exist_ok=True)
 
     def save(self, name: str, content: Mapping[str, Any]) -> None:
@@ -79,17 +83,31 @@ class _Watched:
         self.file.flush()
 
 
-class CheckpointTimer:
-    """When the next checkpoint is due: every `seconds`, rarer when writing takes more than MAX_SHARE of the time."""
+class Checkpoints:
+    """The checkpoint of a run's optimization; made at its start, loaded, and then saved from time to time.
 
-    def __init__(self, seconds: float) -> None:
-        self.seconds = seconds
-        self._due = time.monotonic() + seconds
+    The next one is due every `seconds`, and later while saving, the stage caches included, has taken more than
+    MAX_SHARE of the attempt's time.
+    """
+
+    def __init__(self, work: WorkFolder, seconds: float) -> None:
+        self.work, self.seconds = work, seconds
+        self._started = self._last = time.monotonic()
+
+    def load(self) -> dict[str, Any] | None:
+        """What `save` was given, of the work folder's checkpoint; None without one."""
+        saved = self.work.load(CHECKPOINT)
+        if saved is not None:
+            self.work.earlier_seconds = saved["seconds"]
+        return saved
 
     def due(self) -> bool:
-        return time.monotonic() >= self._due
-
-    def wrote(self, started: float) -> None:
-        """Call after a write that began at `started` (time.monotonic)."""
         now = time.monotonic()
-        self._due = now + max(self.seconds, (now - started) / MAX_SHARE)
+        in_share = self.work.seconds <= MAX_SHARE * (now - self.work.started)
+        return in_share and now >= self._last + self.seconds
+
+    def save(self, content: Mapping[str, Any]) -> None:
+        """Replaces the checkpoint; beside `content` it holds what all attempts have spent on the optimization."""
+        seconds = self.work.earlier_seconds + time.monotonic() - self._started
+        self.work.save(CHECKPOINT, {"seconds": seconds, **content})
+        self._last = time.monotonic()

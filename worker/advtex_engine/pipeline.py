@@ -71,7 +71,7 @@ def texture_scan(
     if not resume:
         folder.clear()
     out.mkdir(parents=True, exist_ok=True)
-    stages = Stages(monitor, folder)
+    stages = Stages(monitor, folder, device)
 
     scene = _load_scene(scan, config, folder, stages, monitor)
     scene, refinement = _refine(scene, config, folder, stages, device)
@@ -83,6 +83,7 @@ def texture_scan(
         given = MethodInput(scene, atlas, maps, means, preset, config, monitor, folder)
         if preset.start == "selection" and config.method.startswith("adversarial"):
             given = replace(given, start=_selected_start(given))
+    stages.save()
     with stages.run("optimization"):
         texture, losses = METHODS[config.method](given)
     with stages.run("dilation"):

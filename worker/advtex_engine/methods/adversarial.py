@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advtex_engine.checkpoint import CHECKPOINT, CheckpointTimer
+from advtex_engine.checkpoint import Checkpoints
 from advtex_engine.discriminator import PatchDiscriminator
 from advtex_engine.errors import Stopped
 from advtex_engine.methods.inputs import LossPoint, MethodInput
@@ -40,10 +39,10 @@ def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     # Weights are drawn on the CPU, so that a run starts from the same discriminator on every device.
     discriminator = PatchDiscriminator(torch.Generator().manual_seed(given.config.seed)).to(device)
     generator = torch.Generator(device).manual_seed(given.config.seed)
-    saved = given.work.load(CHECKPOINT)
+    checkpoints = Checkpoints(given.work, given.config.checkpoint_seconds)
+    saved = checkpoints.load()
     run = _Run(saved["level"], saved["step"], saved["losses"]) if saved else _Run(0, 0, [])
     texture = _start(given)
-    timer = CheckpointTimer(given.config.checkpoint_seconds)
     for number, level in enumerate(preset.levels):
         if number < run.level:
             continue
@@ -62,7 +61,7 @@ def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
         if saved:
             optimizer.load_state_dict(saved["optimizer"])
             saved = None
-        _run_level(given, optimizer, run, sum(part.steps for part in preset.levels[: number + 1]), timer)
+        _run_level(given, optimizer, run, sum(part.steps for part in preset.levels[: number + 1]), checkpoints)
         texture = dense_texture(maps, optimizer.result)
         run.level = number + 1
     return texture.clamp(0, 1), run.losses
@@ -85,7 +84,7 @@ def _pairs(given: MethodInput, maps: ViewMaps) -> Pairs:
 
 
 def _run_level(
-    given: MethodInput, optimizer: AdversarialOptimizer, run: _Run, end: int, timer: CheckpointTimer
+    given: MethodInput, optimizer: AdversarialOptimizer, run: _Run, end: int, checkpoints: Checkpoints
 ) -> None:
     total = given.preset.steps
     every = max(1, total // HISTORY_POINTS)
@@ -97,13 +96,10 @@ def _run_level(
             run.losses.append({"step": run.step, **losses})
             given.monitor.progress(run.step, total, losses)
         stop = given.monitor.stop_requested()
-        if stop or timer.due():
-            started = time.monotonic()
-            given.work.save(
-                CHECKPOINT,
-                {"level": run.level, "step": run.step, "losses": run.losses, "optimizer": optimizer.state_dict()},
+        if stop or checkpoints.due():
+            checkpoints.save(
+                {"level": run.level, "step": run.step, "losses": run.losses, "optimizer": optimizer.state_dict()}
             )
-            timer.wrote(started)
         if stop:
             raise Stopped(f"stopped after step {run.step} of {total}; resume goes on from there")
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from advtex_engine.checkpoint import CHECKPOINT, CheckpointTimer
+from advtex_engine.checkpoint import Checkpoints
 from advtex_engine.errors import Stopped
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.methods.mean import dense_texture
@@ -35,14 +34,14 @@ def descend(
     adam = torch.optim.Adam([values], lr=LR, fused=True)
     total = torch.zeros((), device=values.device)
     first, losses = 0, list[LossPoint]()
-    saved = given.work.load(CHECKPOINT)
+    checkpoints = Checkpoints(given.work, given.config.checkpoint_seconds)
+    saved = checkpoints.load()
     if saved is not None:
         first, losses = saved["step"], saved["losses"]
         values.data.copy_(saved["values"])
         total.copy_(saved["total"])
         adam.load_state_dict(saved["adam"])
         generator.set_state(saved["generator"])
-    timer = CheckpointTimer(given.config.checkpoint_seconds)
     every = max(1, steps // HISTORY_POINTS)
     for step in range(first, steps):
         adam.param_groups[0]["lr"] = LR * (1 - step / steps)
@@ -56,11 +55,9 @@ def descend(
             given.monitor.progress(done, steps, {name: losses[-1][name]})
             total.zero_()
         stop = given.monitor.stop_requested() and done < steps
-        if stop or timer.due():
-            started = time.monotonic()
+        if stop or checkpoints.due():
             state = {"step": done, "losses": losses, "values": values.detach(), "total": total}
-            given.work.save(CHECKPOINT, {**state, "adam": adam.state_dict(), "generator": generator.get_state()})
-            timer.wrote(started)
+            checkpoints.save({**state, "adam": adam.state_dict(), "generator": generator.get_state()})
         if stop:
             raise Stopped(f"stopped after step {done} of {steps}; resume goes on from there")
     return dense_texture(maps, values.detach()).clamp(0, 1), losses

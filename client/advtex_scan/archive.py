@@ -53,6 +53,13 @@ class ScanArchive(ABC):
             raise ArchiveError(Finding("error", "missing_file", name, message, "add the file or correct the name"))
         return self._sizes[name]
 
+    def stamps(self) -> list[tuple[str, int, int]]:
+        """Name, size and stamp of all files, sorted; a file that is changed later has another size or stamp.
+
+        A stamp is the checksum of a zip's member, and the time of a plain file's last change in nanoseconds.
+        """
+        return [(name, size, self._stamp(self._prefix + name)) for name, size in self._sizes.items()]
+
     def open(self, name: str) -> BinaryIO:
         """A buffered stream over a file from its first byte; the caller closes it."""
         self.size(name)
@@ -108,6 +115,9 @@ class ScanArchive(ABC):
         self.close()
 
     @abstractmethod
+    def _stamp(self, name: str) -> int: ...
+
+    @abstractmethod
     def _stream(self, name: str) -> io.RawIOBase: ...
 
     @abstractmethod
@@ -142,6 +152,9 @@ class _ZipArchive(ScanArchive):
     def close(self) -> None:
         self._source.close()
 
+    def _stamp(self, name: str) -> int:
+        return self._extents[name].crc
+
     def _stream(self, name: str) -> io.RawIOBase:
         return MemberStream(self._source, self._extents[name])
 
@@ -165,6 +178,12 @@ class _FolderArchive(ScanArchive):
     def close(self) -> None:
         """A folder holds nothing open."""
 
+    def _stamp(self, name: str) -> int:
+        try:
+            return (self._root / name).stat().st_mtime_ns
+        except OSError as error:
+            raise _unreadable(name, error) from error
+
     def _stream(self, name: str) -> io.RawIOBase:
         return self._open(name)
 
@@ -183,8 +202,12 @@ class _FolderArchive(ScanArchive):
                 raise ArchiveError(_leaves(name))
             return io.FileIO(path, "rb")
         except OSError as error:
-            message = f"cannot be read ({error.strerror})"
-            raise ArchiveError(Finding("error", "unreadable_file", name, message, "check its permissions")) from error
+            raise _unreadable(name, error) from error
+
+
+def _unreadable(name: str, error: OSError) -> ArchiveError:
+    message = f"cannot be read ({error.strerror})"
+    return ArchiveError(Finding("error", "unreadable_file", name, message, "check its permissions"))
 
 
 def _changed(name: str) -> ArchiveError:

@@ -6,6 +6,7 @@ first, symbolic links included, and only then compared; keys of object storage h
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -48,7 +49,7 @@ class References:
         self._roots = tuple(_resolved(_parse(root)) for root in roots)
 
     def fetch(self, url: str, folder: Path, check: Callable[[], None] = lambda: None) -> Path:
-        """The scan on this machine: in place for `file://`, else copied below `folder`.
+        """The scan on this machine: in place for `file://`, else copied below `folder`, with the objects' times.
 
         ReferenceRefused for what is not allowed or no URL; BlobNotFound if there is nothing. check: called between
         pieces, may raise to end it.
@@ -112,13 +113,15 @@ def _copy(place: _Place, url: str, folder: Path, check: Callable[[], None]) -> P
     limits = ArchiveLimits()
     if not found:
         raise BlobNotFound(f"there is nothing at {url}")
-    if len(found) > limits.entries or sum(size for _, size in found) > limits.total_bytes:
-        raise ReferenceRefused(f"{url} is no scan: it holds {len(found)} objects, {sum(s for _, s in found)} bytes")
-    for key, _ in found:
+    total = sum(item.size for item in found)
+    if len(found) > limits.entries or total > limits.total_bytes:
+        raise ReferenceRefused(f"{url} is no scan: it holds {len(found)} objects, {total} bytes")
+    for key, _, modified in found:
         if (reason := unsafe_reason(key)) is not None:
             raise ReferenceRefused(f"{url} holds {key!r}: {reason}")
         try:
             _download(bucket, key, folder / key, check)
+            os.utime(folder / key, ns=(modified, modified))
         except OSError as error:
             raise translated(error) from error
     return folder / name

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import obstore
 from obstore.exceptions import AlreadyExistsError, BaseError, NotFoundError, PreconditionError
@@ -95,21 +96,29 @@ class S3Blobs(Blobs):
             raise BlobsUnavailable(f"there is no bucket {self.bucket!r}, or the keys do not open it") from None
 
 
+class FoundObject(NamedTuple):
+    """An object of any bucket; `modified`: when it was written, nanoseconds since 1970."""
+
+    name: str
+    size: int
+    modified: int
+
+
 class BucketReader:
     """Objects below a prefix of any bucket, by whatever names they have."""
 
     def __init__(self, bucket: str, prefix: str) -> None:
         self._store = _open(bucket, prefix)
 
-    def find(self, name: str) -> list[tuple[str, int]]:
-        """Name and size of the object itself, or else of all below it as of a folder; empty if there are none."""
+    def find(self, name: str) -> list[FoundObject]:
+        """The object itself, or else all below it as of a folder, by name; empty if there are none."""
         try:
             with _translated(name):
-                return [(name, obstore.head(self._store, name)["size"])]
+                return [_found(name, obstore.head(self._store, name))]
         except BlobNotFound:
             with _translated(name):
                 pages = obstore.list(self._store, prefix=name)
-                return sorted((meta["path"], meta["size"]) for page in pages for meta in page)
+                return sorted(_found(meta["path"], meta) for page in pages for meta in page)
 
     def stream(self, name: str) -> Iterator[bytes]:
         """The bytes of an object, in chunks."""
@@ -123,6 +132,11 @@ class BucketReader:
 
 def _open(bucket: str, prefix: str) -> S3Store:
     return S3Store(bucket, prefix=prefix or None, client_options={"allow_http": True}, retry_config={"max_retries": 4})
+
+
+def _found(name: str, meta: obstore.ObjectMeta) -> FoundObject:
+    milliseconds = round(meta["last_modified"].timestamp() * 1000)  # S3 states no finer ones
+    return FoundObject(name, meta["size"], milliseconds * 1_000_000)
 
 
 def _info(meta: obstore.ObjectMeta) -> BlobInfo:

@@ -149,6 +149,24 @@ def test_objects_are_copied(bucket: str, tmp_path: Path) -> None:
         references.fetch(f"s3://{bucket}/public/none", tmp_path)
 
 
+def test_copies_have_the_times_of_the_objects(bucket: str, tmp_path: Path) -> None:
+    """So that a later attempt, which copies again, can tell whether it has the same scan."""
+    references = References([f"s3://{bucket}/public"])
+
+    def times(copy: str) -> dict[str, int]:
+        folder = references.fetch(f"s3://{bucket}/public/a", tmp_path / copy)
+        return {path.name: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+    first = times("first")
+    assert times("second") == first
+    store = S3Store(bucket, client_options={"allow_http": True})
+    written = obstore.head(store, "public/a/scan.json")["last_modified"]
+    while obstore.head(store, "public/a/scan.json")["last_modified"] == written:  # a HEAD states whole seconds
+        obstore.put(store, "public/a/scan.json", b"public/a/SCAN.json")
+    changed = times("third")
+    assert {name for name in changed if changed[name] != first[name]} == {"scan.json"}
+
+
 @pytest.mark.parametrize(
     "path", ["private", "private/scan.json", "public-2/x", "public/../private", "public/%2e%2e/private", "public/a?x"]
 )

@@ -10,6 +10,7 @@ import os
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,16 +51,23 @@ def ingest(scan: Path, config: TextureConfig, monitor: Monitor) -> Scene:
 
     Raises ScanError with one problem per finding, naming file and remedy.
     """
+    with opened(scan) as archive:
+        reading = read_scan(archive)
+        errors = [_problem(finding) for finding in reading.report.findings if finding.severity == "error"]
+        if errors or reading.manifest is None:
+            raise ScanError(*errors)
+        for finding in reading.report.findings:
+            if finding.severity == "warning":
+                monitor.warning(_problem(finding))
+        return load_scene(archive, reading.manifest, config, monitor)
+
+
+@contextmanager
+def opened(scan: Path) -> Iterator[ScanArchive]:
+    """A scan's files. Raises ScanError, also for what is found to be wrong with them while they are open."""
     try:
         with open_scan(scan) as archive:
-            reading = read_scan(archive)
-            errors = [_problem(finding) for finding in reading.report.findings if finding.severity == "error"]
-            if errors or reading.manifest is None:
-                raise ScanError(*errors)
-            for finding in reading.report.findings:
-                if finding.severity == "warning":
-                    monitor.warning(_problem(finding))
-            return load_scene(archive, reading.manifest, config, monitor)
+            yield archive
     except ScanFormatError as error:
         raise ScanError(*map(_problem, error.findings)) from error
 

@@ -24,7 +24,7 @@ from advtex_engine.config import PRESETS, Preset, PyramidLevel, TextureConfig
 from advtex_engine.errors import OptionError
 from advtex_engine.export import export_model
 from advtex_engine.geometry import clean, decimate
-from advtex_engine.ingest import ingest
+from advtex_engine.ingest import ingest, opened
 from advtex_engine.methods import METHODS, MethodInput, require
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.view_selection import select_views
@@ -136,10 +136,15 @@ def resolve_preset(config: TextureConfig, device: torch.device) -> Preset:
 
 
 def fingerprint(scan: Path, config: TextureConfig) -> str:
-    """Identifies a run: the scan's file names and sizes, and every option that changes the result."""
-    files = [scan] if scan.is_file() else sorted(path for path in scan.rglob("*") if path.is_file())
+    """Identifies a run: the state of the scan's files, and every option that changes the result.
+
+    A zip keeps its fingerprint wherever it is copied; a folder keeps it where copies keep the files' times.
+    Raises ScanError for what cannot be opened.
+    """
+    with opened(scan) as archive:
+        files = archive.stamps()
     options = {key: value for key, value in asdict(config).items() if key not in ("device", "checkpoint_seconds")}
-    content = {"files": [(path.name, path.stat().st_size) for path in files], "options": options}
+    content = {"files": files, "options": options}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 

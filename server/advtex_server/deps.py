@@ -31,6 +31,11 @@ async def _webhooks(request: Request) -> WebhookService:
     return cast(WebhookService, request.app.state.webhooks)
 
 
+async def anyone(request: Request, _key: _Key) -> Caller:
+    """The caller, whatever the key's scopes."""
+    return cast(Caller, request.state.caller)
+
+
 async def reader(request: Request, _key: _Key) -> Caller:
     """The caller, who may look."""
     return _with_scope(request, "read")
@@ -48,6 +53,7 @@ def _with_scope(request: Request, scope: str) -> Caller:
     return caller
 
 
+Anyone = Annotated[Caller, Depends(anyone)]
 Reader = Annotated[Caller, Depends(reader)]
 Writer = Annotated[Caller, Depends(writer)]
 TheIntake = Annotated[Intake, Depends(_intake)]

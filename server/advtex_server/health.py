@@ -71,6 +71,12 @@ def _workers(store: Store) -> Check:
         return Check("workers", False, False, "not known while Redis does not answer")
     if not living:
         return Check("workers", False, False, "no worker is running, jobs are accepted and wait: start advtex-worker")
+    try:
+        pauses = store.tallies.pauses()
+    except SQLAlchemyError:  # told by its own check
+        pauses = []
+    if pauses:
+        return Check("workers", False, False, f"{len(living)} running; {'; '.join(pauses)}")
     return Check("workers", True, False, f"{len(living)} running")
 
 

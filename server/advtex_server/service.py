@@ -15,6 +15,7 @@ import structlog
 from sqlalchemy.exc import SQLAlchemyError
 
 from advtex_contract.errors import ErrorCode, ErrorDetail
+from advtex_contract.health import KeyView
 from advtex_contract.jobs import (
     JobError,
     JobPage,
@@ -60,6 +61,18 @@ class Service:
             max_upload_bytes=self.settings.max_upload_bytes,
             retention_seconds=self.settings.retention_seconds,
             max_retention_seconds=self.settings.max_retention_seconds,
+        )
+
+    def key(self, caller: Caller) -> KeyView:
+        usage = self.store.accounts.usage(caller.owner)
+        return KeyView(
+            id=caller.key_id,
+            scopes=sorted(caller.scopes),
+            expires_at=None if caller.expires_at is None else _time(caller.expires_at),
+            active_jobs=usage.active_jobs,
+            max_active_jobs=caller.max_active_jobs,
+            bytes=usage.bytes,
+            max_bytes=caller.max_bytes,
         )
 
     # -- jobs -----------------------------------------------------------------------------------------------------
@@ -206,6 +219,7 @@ def _rejection(details: list[ErrorDetail]) -> JobError:
 def job_view(row: JobRow) -> JobView:
     """The row as the API shows it."""
     state = JobState(row.state)
+    paused = row.waiting_reason if state is JobState.running else ""
     results = [
         ResultFile(
             name=f["name"],
@@ -226,7 +240,7 @@ def job_view(row: JobRow) -> JobView:
         options=JobOptions.model_validate(row.options),
         priority=row.priority,
         attempt=row.attempt - 1 if state in WAITING else row.attempt,
-        waiting_reason=(row.waiting_reason or IN_LINE) if state in WAITING else "",
+        waiting_reason=(row.waiting_reason or IN_LINE) if state in WAITING else paused,
         memory_bytes=row.memory_bytes,
         progress=Progress.model_validate(row.progress),
         warnings=[ErrorDetail.model_validate(w) for w in row.warnings],

@@ -31,6 +31,7 @@ class Caller:
     scopes: frozenset[str]
     max_active_jobs: int | None = None
     max_bytes: int | None = None
+    expires_at: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +94,8 @@ class Accounts:
                 return None
             if row.expires_at is not None and row.expires_at <= self.database.now(session):
                 return None
-            return Caller(row.id, row.owner, frozenset(row.scopes), row.max_active_jobs, row.max_bytes)
+            scopes = frozenset(row.scopes)
+            return Caller(row.id, row.owner, scopes, row.max_active_jobs, row.max_bytes, row.expires_at)
 
     def rotate_key(self, key_id: str, keep_seconds: float = 0.0) -> str:
         """A new key with everything that the old one had; the old one works for `keep_seconds` more."""

@@ -68,7 +68,8 @@ class JobRow(Base):
     reached, reached_at_claim, deaths: how far any attempt got, where this one began, and how many attempts in a row
     died without getting farther.
     source: the URL of a scan that stays where it is; its upload row is a mere placeholder.
-    memory_bytes: what a worker must have (`needs.py`). waiting_reason: the dispatcher's, for people.
+    memory_bytes: what a worker must have (`needs.py`). waiting_reason: for people, the
+    dispatcher's while the job waits and the worker's while it pauses.
     tidied_at: when what no result needs was removed.
     """
 

@@ -106,6 +106,7 @@ class Records:
                 worker=worker[:255],
                 lease_expires_at=expires_at,
                 reached_at_claim=JobRow.reached,
+                waiting_reason="",
             )
             return Claim(
                 job_id=row.id,
@@ -128,22 +129,24 @@ class Records:
         reached: int = 0,
         lease_seconds: float | None = None,
         log_tail: str | None = None,
+        waiting_reason: str | None = None,
     ) -> Lease:
         """Keep the lease and tell how far the attempt is. StaleAttempt: the lease is lost.
 
         reached: any number that grows with the work and means the same in every attempt (say, stage index times
         10^7 plus step). Deaths count towards poison only while no attempt gets farther than the ones before.
         log_tail: the newest lines of the engine's log, shown if the job has to be given up.
+        waiting_reason: why the attempt pauses, in words; empty when it does not.
         """
         with self.database.write() as session:
             now = self.database.now(session)
-            row = session.scalar(select(JobRow).where(_held(job_id, attempt)).with_for_update())
-            if row is None:
-                raise StaleAttempt(self._why_stale(session, job_id, attempt))
+            row = self._running(session, job_id, attempt)
             row.lease_expires_at = now + (lease_seconds or self.lease_seconds)
             row.reached = max(row.reached, reached)
             if log_tail is not None:
                 row.log_tail = log_tail[-8000:]
+            if waiting_reason is not None and (reason := waiting_reason[:255]) != row.waiting_reason:
+                row.waiting_reason, row.updated_at, row.version = reason, now, row.version + 1
             if progress is not None and (data := progress.model_dump(mode="json")) != row.progress:
                 stage_changed = progress.stage != row.progress.get("stage")
                 row.progress, row.updated_at, row.version = data, now, row.version + 1

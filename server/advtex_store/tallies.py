@@ -66,6 +66,12 @@ class Tallies:
         with self.database.read() as session:
             return list(session.scalars(select(TallyRow).order_by(TallyRow.name, TallyRow.label)))
 
+    def pauses(self) -> list[str]:
+        """Why running jobs pause, each reason once."""
+        query = select(JobRow.waiting_reason).where(JobRow.state == JobState.running, JobRow.waiting_reason != "")
+        with self.database.read() as session:
+            return sorted(set(session.scalars(query)))
+
     def load(self) -> Load:
         """How much there is to do."""
         waiting = select(func.count(), func.min(JobRow.created_at)).where(

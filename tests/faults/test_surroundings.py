@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import subprocess
+import sys
 import threading
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -124,6 +129,64 @@ def test_a_disk_that_is_full_refuses_the_upload_and_keeps_the_service(
             assert client.wait_for_job(job.id, timeout=30).state is JobState.succeeded
         left = sum(path.stat().st_size for path in small_disk.rglob("*") if path.is_file())
         assert left < 1 << 20, "pieces of the refused upload were kept"
+
+
+def fill(disk: Path) -> Path:
+    """A file that takes all the room there is."""
+    ballast = disk / "ballast"
+    with suppress(OSError), ballast.open("wb", buffering=0) as file:
+        while shutil.disk_usage(disk).free:
+            file.write(bytes(1 << 12))
+    return ballast
+
+
+def test_a_full_disk_of_a_worker_pauses_its_job_and_everybody_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_disk: Path, scan: Path
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    with live_service(tmp_path / "live", settings={"ADVTEX_WORK_DIR": str(small_disk)}) as service:
+
+        def workers() -> Any:
+            return httpx.get(f"{service.url}/readyz").json()["checks"]["workers"]
+
+        service.start_worker("quick")
+        wait_until(lambda: workers()["ok"])
+        ballast = fill(small_disk)
+        with service.client() as client:
+            job = client.submit(scan)
+            wait_until(lambda: "disk" in client.get_job(job.id).waiting_reason)
+            assert client.get_job(job.id).state is JobState.running
+            assert not workers()["ok"]
+            assert str(small_disk) in workers()["message"]
+            doctor = subprocess.run(
+                [sys.executable, "-m", "advtex_server.main", "doctor"],
+                env=service.environment,
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+            assert str(small_disk) in doctor.stdout + doctor.stderr
+            ballast.unlink()
+            done = client.wait_for_job(job.id, timeout=30)
+        assert (done.state, done.attempt, done.waiting_reason) == (JobState.succeeded, 1, "")
+        assert workers()["ok"]
+
+
+@pytest.mark.parametrize("engine", ["hangs", "hangs_alone"])
+def test_a_cancel_is_over_two_seconds_after_its_post(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scan: Path, engine: str
+) -> None:
+    """With the heartbeat and the grace period that workers have by default, in a stage that never ends."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    usual = {"ADVTEX_HEARTBEAT_SECONDS": "0.5", "ADVTEX_GRACE_SECONDS": "30"}
+    with live_service(tmp_path / "live", settings=usual) as service, service.client() as client:
+        service.start_worker(engine)
+        job = client.submit(scan)
+        wait_until(lambda: client.get_job(job.id).progress.stage)
+        asked = time.monotonic()
+        client.cancel_job(job.id)
+        wait_until(lambda: client.get_job(job.id).state is JobState.canceled)
+        assert time.monotonic() - asked < 2.0
 
 
 def test_a_disk_that_fills_up_during_an_upload_keeps_nothing_of_it(

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from advtex_contract.health import KeyView
 from advtex_server.doorkeeper import KNOWN_SECONDS, Doorkeeper
 from advtex_server.refusal import ApiError
 from advtex_store.accounts import Caller
@@ -92,6 +93,25 @@ def test_guessing_over_http(make_live: Callable[..., Any], is_error: Any) -> Non
         assert int(refused.headers["retry-after"]) > 0
 
 
+def test_behind_a_trusted_proxy_callers_have_addresses_of_their_own(make_live: Callable[..., Any]) -> None:
+    """uvicorn trusts this machine by default; FORWARDED_ALLOW_IPS names others."""
+    live = make_live(auth_failures_per_minute=1)
+    with live.client("adv_000000000000_" + "a" * 40) as stranger:
+        came_from = ("1.1.1.1", "1.1.1.1", "2.2.2.2")
+        statuses = [stranger.get("/v1/jobs", headers={"X-Forwarded-For": ip}).status_code for ip in came_from]
+    assert statuses == [401, 429, 401]
+
+
+def test_a_proxy_that_is_not_named_speaks_for_nobody(
+    make_live: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FORWARDED_ALLOW_IPS", "10.9.8.7")
+    live = make_live(auth_failures_per_minute=1)
+    with live.client("adv_000000000000_" + "a" * 40) as stranger:
+        statuses = [stranger.get("/v1/jobs", headers={"X-Forwarded-For": f"1.1.1.{n}"}).status_code for n in range(2)]
+    assert statuses == [401, 429]
+
+
 def test_scopes_and_expiry(live: Any, is_error: Any) -> None:
     accounts = live.store.accounts
     with live.client(accounts.create_key("r", owner="me", scopes=["read"])) as reader:
@@ -102,6 +122,21 @@ def test_scopes_and_expiry(live: Any, is_error: Any) -> None:
         is_error(writer.get("/v1/jobs"), 403, "forbidden")
     with live.client(accounts.create_key("old", owner="me", expires_at=time.time() - 1)) as expired:
         is_error(expired.get("/v1/jobs"), 401, "unauthorized")
+
+
+def test_a_key_can_be_asked_what_it_may_do(live: Any, is_error: Any, scan_zip: Path) -> None:
+    end = int(time.time()) + 600
+    key = live.store.accounts.create_key("w", owner="me", scopes=["write"], expires_at=end, max_active_jobs=3)
+    with live.client(key) as writer:
+        upload = writer.post("/v1/uploads", content=scan_zip.read_bytes()).json()
+        writer.post("/v1/jobs", json={"upload_id": upload["id"]})
+        found = KeyView.model_validate(writer.get("/v1/key").json())
+    assert (found.id, found.scopes, found.max_active_jobs, found.max_bytes) == (key.split("_")[1], ["write"], 3, None)
+    assert (found.active_jobs, found.bytes) == (1, upload["size"])
+    assert found.expires_at is not None
+    assert found.expires_at.timestamp() == end
+    with live.client("adv_000000000000_" + "a" * 40) as stranger:
+        is_error(stranger.get("/v1/key"), 401, "unauthorized")
 
 
 def test_a_rotated_key_sees_the_same_jobs(live: Any, is_error: Any, scan_zip: Path) -> None:

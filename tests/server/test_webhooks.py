@@ -307,6 +307,12 @@ def test_urls_that_are_none_for_webhooks(url: str) -> None:
         TargetRules().resolve(url)
 
 
+def test_how_long_they_are_tried_is_described(live: Any) -> None:
+    text = live.http.get("/openapi.json").json()["paths"]["/v1/webhooks"]["post"]["description"]
+    assert f"after {outbox.MOST_FAILURES} tries" in text
+    assert f"within {outbox.KEPT_SECONDS / 86400:g} days" in text
+
+
 def test_a_name_is_resolved_once_and_its_address_is_pinned(monkeypatch: pytest.MonkeyPatch) -> None:
     """DNS rebinding: a public address for the check, and loopback a moment later."""
     answers = [["1.1.1.1"], ["127.0.0.1"]]

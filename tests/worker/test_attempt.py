@@ -5,18 +5,17 @@ from __future__ import annotations
 import json
 import os
 import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import fake_engines
 import pytest
-import structlog
+from attempts import in_background, result, step_of
+from live_service import wait_until
 
 from advtex_contract.jobs import JobState
 from advtex_store import keys
-from advtex_store.blobs import FolderBlobs
 from advtex_store.errors import BlobsUnavailable, NoSpace
 from advtex_store.models import JobRow
 from advtex_store.results import Results
@@ -26,33 +25,6 @@ from advtex_worker.tasks import Host, run_attempt
 
 Hosts = Callable[[str], Host]
 NewJob = Callable[..., str]
-
-
-def result(store: Store, job_id: str, name: str = "model.obj") -> str:
-    manifest = store.results.manifest(job_id)
-    (file,) = [file for file in manifest.files if file.name == name]
-    return store.blobs.get(file.key).decode()
-
-
-def wait_until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(0.02)
-
-
-def in_background(host: Host, job_id: str, attempt: int = 1) -> threading.Thread:
-    thread = threading.Thread(target=run_attempt, args=(host, job_id, attempt))
-    thread.start()
-    return thread
-
-
-def step_of(store: Store, job_id: str) -> int:
-    return int(store.records.job(job_id).progress["step"])
-
-
-def spent(store: Store, job_id: str) -> float:
-    return float(sum(store.records.job(job_id).progress["stage_seconds"].values()))
 
 
 def test_a_job_succeeds_with_results_warnings_and_progress(
@@ -112,9 +84,11 @@ def test_an_error_that_would_come_again_fails_the_job(
 
 def test_a_full_disk_pauses_the_attempt_and_costs_nothing(store: Store, host: Hosts, new_job: NewJob) -> None:
     job_id = new_job()
-    run_attempt(host("finds_the_disk_full"), job_id, 1)
+    thread = in_background(host("finds_the_disk_full"), job_id)
+    wait_until(lambda: "disk" in store.records.job(job_id).waiting_reason)
+    thread.join()
     row = store.records.job(job_id)
-    assert (row.state, row.attempt) == (JobState.succeeded, 1)
+    assert (row.state, row.attempt, row.waiting_reason) == (JobState.succeeded, 1, "")
 
 
 def test_a_bad_scan_is_rejected_with_every_problem(store: Store, host: Hosts, new_job: NewJob) -> None:
@@ -170,27 +144,6 @@ def test_the_attempt_after_a_death_goes_on_from_the_checkpoint(store: Store, hos
     assert [warning["code"] for warning in store.records.job(job_id).warnings] == ["few_views"]
 
 
-def test_cancel_stops_within_two_seconds_and_retry_goes_on(store: Store, host: Hosts, new_job: NewJob) -> None:
-    job_id = new_job(steps=150)
-    thread = in_background(host("stepping"), job_id)
-    wait_until(lambda: step_of(store, job_id) >= 15)
-    asked = time.monotonic()
-    store.records.cancel(job_id)
-    thread.join()
-    assert time.monotonic() - asked < 2.0
-    assert store.records.job(job_id).state == JobState.canceled
-    reached, before = step_of(store, job_id), spent(store, job_id)
-    assert before > 0
-    store.records.retry(job_id)
-    run_attempt(host("stepping"), job_id, 2)
-    state = json.loads(result(store, job_id).split("\n", 1)[1])
-    assert state["chain"] == fake_engines.chain(150)
-    assert state["began"][0] == 0
-    assert reached <= state["began"][1] < 150, "the checkpoint of the stop itself was not used"
-    assert spent(store, job_id) >= before + 0.01 * (150 - state["began"][1]), "the first attempt's seconds were lost"
-    assert list(store.blobs.list(keys.checkpoints_prefix(job_id))) == [], "checkpoints outlived the results"
-
-
 def test_sigterm_preempts_without_counting_as_a_death(store: Store, host: Hosts, new_job: NewJob) -> None:
     job_id = new_job(steps=100)
     for attempt in (1, 2, 3, 4):
@@ -219,57 +172,6 @@ def test_a_sigterm_to_the_runner_alone_is_a_preemption_too(store: Store, host: H
     os.waitpid(parent, 0)
     row = store.records.job(job_id)
     assert (row.state, row.attempt, row.deaths) == (JobState.preempted, 2, 0)
-
-
-def test_a_cancel_does_not_wait_for_a_long_fetch(
-    store: Store, settings: WorkerSettings, new_job: NewJob, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    job_id = new_job()
-    asked = threading.Event()
-
-    def endless(*_arguments: object) -> Iterator[bytes]:
-        store.records.cancel(job_id)
-        asked.set()
-        while True:
-            time.sleep(0.01)
-            yield b"0"
-
-    monkeypatch.setattr(FolderBlobs, "stream", endless)
-    monkeypatch.setattr(Results, "adopt", lambda _self, _job_id: False)
-    began = time.monotonic()
-    run_attempt(Host(settings, engine="fake_engines:quick"), job_id, 1)
-    assert asked.is_set()
-    assert time.monotonic() - began < 2.0
-    assert store.records.job(job_id).state == JobState.canceled
-
-
-@pytest.mark.parametrize("slow", ["restore", "commit", "checkpoint"])
-def test_a_cancel_does_not_wait_for_the_storage(
-    store: Store, host: Hosts, new_job: NewJob, monkeypatch: pytest.MonkeyPatch, slow: str
-) -> None:
-    """Neither for a checkpoint on its way here, nor for results or a checkpoint on their way there."""
-    job_id = new_job(steps=20 if slow == "commit" else 1000)
-    hung, go_on = threading.Event(), threading.Event()
-
-    def hang(*_arguments: Any) -> Any:
-        hung.set()
-        go_on.wait(20)
-        raise BlobsUnavailable("no answer")
-
-    if slow == "restore":
-        monkeypatch.setattr("advtex_worker.attempt.restore", hang)
-    elif slow == "commit":
-        monkeypatch.setattr(Results, "commit", hang)
-    else:
-        monkeypatch.setattr(FolderBlobs, "upload", hang)
-    thread = in_background(host("stepping"), job_id)
-    assert hung.wait(10)
-    asked = time.monotonic()
-    store.records.cancel(job_id)
-    wait_until(lambda: store.records.job(job_id).state == JobState.canceled)
-    assert time.monotonic() - asked < 2.0
-    go_on.set()
-    thread.join()
 
 
 def test_a_storage_that_fails_for_a_while_delays_the_results(
@@ -317,30 +219,6 @@ def test_a_runner_that_does_not_stop_is_killed_after_the_grace(
     thread.join()
     assert 1.0 <= time.monotonic() - asked < 4.0
     assert store.records.job(job_id).state == JobState.preempted
-
-
-@pytest.mark.parametrize("asked_before", [False, True])
-@pytest.mark.parametrize(("engine", "ends"), [("hangs", "stopped"), ("ignores_stop", "stopped"), ("hangs_alone", None)])
-def test_a_cancel_in_a_long_stage_is_recorded_within_two_seconds(
-    store: Store, settings: WorkerSettings, new_job: NewJob, engine: str, ends: str | None, asked_before: bool
-) -> None:
-    """The runner ends by itself; only one that cannot run Python at all is killed. A drain before changes nothing."""
-    usual = {name: WorkerSettings.model_fields[name].default for name in ("heartbeat_seconds", "grace_seconds")}
-    given = Host(settings.model_copy(update=usual), engine=f"fake_engines:{engine}")
-    job_id = new_job()
-    with structlog.testing.capture_logs() as lines:
-        thread = in_background(given, job_id)
-        wait_until(lambda: store.records.job(job_id).progress["stage"] != "")
-        if asked_before:
-            given.stop_signal._on_signal(signal.SIGTERM, None)
-        asked = time.monotonic()
-        store.records.cancel(job_id)
-        wait_until(lambda: store.records.job(job_id).state == JobState.canceled)
-        took = time.monotonic() - asked
-        thread.join()
-    assert took < 2.0
-    (ending,) = [line["ending"] for line in lines if line["event"] == "runner ended"]
-    assert ending == (ends or "the engine's process was killed (out of memory?): SIGKILL")
 
 
 def test_a_lost_lease_ends_the_runner_and_commits_nothing(store: Store, host: Hosts, new_job: NewJob) -> None:

@@ -29,6 +29,7 @@ from advtex_worker.adapt import texture_config
 from advtex_worker.child import child_environment, death_sentence
 from advtex_worker.events import (
     CheckpointEvent,
+    DiskFullEvent,
     Event,
     FailedEvent,
     FinishedEvent,
@@ -112,6 +113,7 @@ def test_every_option_arrives(
         StageEvent(stage="atlas", seconds=1.5),
         ProgressEvent(step=1, steps=2, losses={"l1": 0.5}),
         CheckpointEvent(files={"a/b": Path("/x/1")}),
+        DiskFullEvent(),
         FinishedEvent(),
         StoppedEvent(),
         FailedEvent(code="engine_error", message="two\nlines"),
@@ -194,7 +196,14 @@ class FakeRecords:
         self.heard: list[tuple[Any, int, str | None]] = []
 
     def heartbeat(
-        self, job_id: str, attempt: int, progress: Progress | None = None, *, reached: int, log_tail: str | None
+        self,
+        job_id: str,
+        attempt: int,
+        progress: Progress | None = None,
+        *,
+        reached: int,
+        log_tail: str | None,
+        waiting_reason: str,
     ) -> Lease:
         self.heard.append((progress, reached, log_tail))
         if isinstance(self.answer, Exception):

@@ -6,6 +6,7 @@ import fcntl
 import math
 import os
 import shutil
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -21,13 +22,15 @@ from sqlalchemy.exc import SQLAlchemyError
 from advtex_contract.errors import ErrorDetail
 from advtex_contract.jobs import JobError
 from advtex_store import keys
-from advtex_store.errors import BlobNotFound, ReferenceRefused, StaleAttempt, StoreError
+from advtex_store.errors import BlobNotFound, NoSpace, ReferenceRefused, StaleAttempt, StoreError
+from advtex_store.files import translated
 from advtex_store.records import Claim
 from advtex_store.store import Store
 from advtex_worker.checkpoints import CheckpointUploader, restore
 from advtex_worker.child import Child, death_sentence
 from advtex_worker.events import (
     CheckpointEvent,
+    DiskFullEvent,
     FailedEvent,
     FinishedEvent,
     ProgressEvent,
@@ -241,8 +244,12 @@ class Attempt:
                         self._warnings += (event.problem,)
                 case CheckpointEvent():
                     uploader.add(event.files, self._warnings)
+                case DiskFullEvent():
+                    self._keeper.paused = self._no_room(f"{self._settings.workspaces}")
+                    continue
                 case _:
                     return event
+            self._keeper.paused = ""
             self._keeper.report(tracker.view, tracker.reached)
         return None
 
@@ -308,6 +315,9 @@ class Attempt:
     def _out_of_time(self) -> bool:
         return time.monotonic() - self._canceled_at >= RECORD_SECONDS
 
+    def _no_room(self, place: str) -> str:
+        return f"the disk of its worker {socket.gethostname()} is full ({place}); it goes on when there is room"
+
     def _log_tail(self) -> str:
         return self._child.log_tail() if self._child else ""
 
@@ -344,12 +354,21 @@ class Attempt:
         """Try until the storage plays along: a full disk or an unreachable bucket pauses the work and loses nothing."""
         while True:
             try:
-                return action()
+                done = action()
             except (StaleAttempt, BlobNotFound, ReferenceRefused):
                 raise
             except (OSError, StoreError, SQLAlchemyError) as error:
+                if _is_disk_full(error):
+                    self._keeper.paused = self._no_room(f"{self._settings.workspaces} or the storage")
                 self._log.warning("storage is in trouble, trying again", error=f"{type(error).__name__}: {error}")
+            else:
+                self._keeper.paused = ""
+                return done
             for _ in range(int(RETRY_SECONDS / 0.5)):
                 if self._keeper.ending:
                     raise Interrupted
                 time.sleep(0.5)
+
+
+def _is_disk_full(error: Exception) -> bool:
+    return isinstance(translated(error) if isinstance(error, OSError) else error, NoSpace)

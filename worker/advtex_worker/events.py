@@ -70,6 +70,12 @@ class CheckpointEvent(_Message):
     files: dict[str, Path]
 
 
+class DiskFullEvent(_Message):
+    """The engine waits for room below the work folder, and goes on from its checkpoint."""
+
+    kind: Literal["disk_full"] = "disk_full"
+
+
 class FinishedEvent(_Message):
     """All results are in the out folder."""
 
@@ -92,7 +98,7 @@ class StoppedEvent(_Message):
 
 
 Ending = FinishedEvent | FailedEvent | StoppedEvent
-Event = StageEvent | ProgressEvent | WarningEvent | CheckpointEvent | FinishedEvent | FailedEvent | StoppedEvent
+Event = StageEvent | ProgressEvent | WarningEvent | CheckpointEvent | DiskFullEvent | Ending
 _EVENT: TypeAdapter[Event] = TypeAdapter(Annotated[Event, Field(discriminator="kind")])
 
 

@@ -31,7 +31,8 @@ class LeaseKeeper:
     """Renews the lease with the newest progress, and finds out that the user or the server wants the run ended.
 
     A database that cannot be reached is no loss until the lease is about to run out; a second thread watches that,
-    since a heartbeat may hang. `on_ending` is called from these threads, once per reason.
+    since a heartbeat may hang. `on_ending` is called from these threads, once per reason. `paused`: set from outside,
+    why the run does not go on at the moment, for people.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class LeaseKeeper:
         self._beating = threading.Lock()
         self._deciding = threading.Lock()
         self.ending: Ending | None = None
+        self.paused = ""
         self._told: set[Ending] = set()
         self._threads = [
             threading.Thread(target=self._work, name="lease", daemon=True),
@@ -95,7 +97,14 @@ class LeaseKeeper:
             news = tail if tail != self._told_tail else None
             until = self._until()  # taken before it is asked for: the rows' lease ends later than this
             try:
-                lease = self._records.heartbeat(self._job_id, self._attempt, progress, reached=reached, log_tail=news)
+                lease = self._records.heartbeat(
+                    self._job_id,
+                    self._attempt,
+                    progress,
+                    reached=reached,
+                    log_tail=news,
+                    waiting_reason=self.paused,
+                )
             except StaleAttempt as error:
                 log.warning("lease lost", job=self._job_id, attempt=self._attempt, reason=str(error))
                 self.end(Ending.lost)

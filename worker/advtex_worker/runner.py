@@ -28,6 +28,7 @@ from advtex_worker.events import (
     CANCEL_SECONDS,
     STOP_LINE,
     CheckpointEvent,
+    DiskFullEvent,
     Ending,
     Event,
     FailedEvent,
@@ -101,6 +102,7 @@ class Reporter(Monitor):
 def run(request: Request, reporter: Reporter) -> Ending:
     """Run the engine and say how it ended. A full disk is no end: the engine goes on from its checkpoint later."""
     while (ending := _run_once(request, reporter)) is None:
+        reporter.tell(DiskFullEvent())
         print(f"the disk is full: waiting {DISK_SECONDS:.0f} s", file=sys.stderr, flush=True)
         if reporter.wait_for_stop(DISK_SECONDS):
             return StoppedEvent()

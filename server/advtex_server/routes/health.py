@@ -5,31 +5,36 @@ from __future__ import annotations
 from typing import cast
 
 from fastapi import APIRouter, Request, Response
-from fastapi.responses import JSONResponse
 
-from advtex_server.deps import TheService
+from advtex_contract.health import Alive, KeyView, PartView, Readiness
+from advtex_server.deps import Anyone, TheService
 from advtex_server.health import checks
 from advtex_server.metrics import Metrics
+from advtex_server.refusal import WITH_KEY
 
 router = APIRouter(tags=["operation"])
 
 
 @router.get("/healthz")
-async def healthz() -> dict[str, str]:
+async def healthz() -> Alive:
     """The process answers."""
-    return {"status": "ok"}
+    return Alive()
 
 
-@router.get("/readyz", responses={503: {"description": "something essential does not work"}})
-def readyz(service: TheService) -> Response:
+@router.get("/readyz", responses={503: {"model": Readiness, "description": "something essential does not work"}})
+def readyz(service: TheService, response: Response) -> Readiness:
     """Whether work can be accepted, with one sentence per part that does not work."""
     found = checks(service.store, service.settings)
     ready = all(check.ok or not check.essential for check in found)
-    content = {
-        "ready": ready,
-        "checks": {c.name: {"ok": c.ok, "essential": c.essential, "message": c.message} for c in found},
-    }
-    return JSONResponse(content, 200 if ready else 503)
+    response.status_code = 200 if ready else 503
+    parts = {c.name: PartView(ok=c.ok, essential=c.essential, message=c.message) for c in found}
+    return Readiness(ready=ready, checks=parts)
+
+
+@router.get("/v1/key", tags=["keys"], responses=WITH_KEY)
+def get_key(caller: Anyone, service: TheService) -> KeyView:
+    """The key that this is asked with: what it may do, until when, and how much is left of its limits."""
+    return service.key(caller)
 
 
 @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import random
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 from urllib.parse import quote
@@ -23,6 +24,7 @@ from advtex_client.errors import (
 )
 from advtex_client.uploads import FileStream, PackedScan
 from advtex_contract.errors import ErrorCode
+from advtex_contract.health import Alive, KeyView, Readiness
 from advtex_contract.jobs import (
     TERMINAL,
     BatchPage,
@@ -64,6 +66,18 @@ class Pause:
     """Seconds to wait before the next call."""
 
     seconds: float
+
+
+def alive() -> Call[Alive]:
+    return Call("GET", "/healthz", reader(Alive))
+
+
+def readiness() -> Call[Readiness]:
+    return Call("GET", "/readyz", _readiness)
+
+
+def get_key() -> Call[KeyView]:
+    return Call("GET", "/v1/key", reader(KeyView))
 
 
 def get_job(job_id: str) -> Call[JobView]:
@@ -174,6 +188,14 @@ def reader(model: type[M]) -> Callable[[httpx.Response], M]:
             ) from error
 
     return read
+
+
+def _readiness(response: httpx.Response) -> Readiness:
+    """Its 503 has the same body, with what is wrong."""
+    if response.status_code == 503:
+        with suppress(ValidationError):
+            return Readiness.model_validate_json(response.content)
+    return reader(Readiness)(response)
 
 
 def _offset(response: httpx.Response) -> int:

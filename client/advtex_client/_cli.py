@@ -12,6 +12,7 @@ import typer
 from pydantic import ValidationError
 
 from advtex_client._display import Display
+from advtex_client.doctor import ServerNotReady
 from advtex_client.errors import (
     AuthError,
     BusyError,
@@ -33,6 +34,7 @@ EXIT_CODES: dict[type[ClientError], int] = {
     NetworkError: 6,
     ServerError: 6,
     BusyError: 6,
+    ServerNotReady: 6,
     IntegrityError: 6,
     WaitTimeoutError: 7,
 }
@@ -60,6 +62,10 @@ KeepOption = Annotated[
 ]
 
 
+def exit_code_of(error: ClientError) -> int:
+    return next((code for kind, code in EXIT_CODES.items() if isinstance(error, kind)), USAGE)
+
+
 @contextmanager
 def command(as_json: bool) -> Iterator[Display]:
     """Every command's frame: errors become one message and an exit code."""
@@ -67,7 +73,7 @@ def command(as_json: bool) -> Iterator[Display]:
     try:
         yield display
     except ClientError as error:
-        exit_code = next((code for kind, code in EXIT_CODES.items() if isinstance(error, kind)), USAGE)
+        exit_code = exit_code_of(error)
         display.failure(error, exit_code)
         raise typer.Exit(exit_code) from error
     except KeyboardInterrupt as error:

@@ -22,6 +22,7 @@ from advtex_client.downloads import Download, OnFileBytes, is_there, target_path
 from advtex_client.errors import ClientError, NotFoundError
 from advtex_client.memory import SubmissionMemory, upload_alone
 from advtex_client.uploads import OnBytes, PackedScan, packed
+from advtex_contract.health import KeyView, Readiness
 from advtex_contract.jobs import BatchView, JobSpec, JobState, JobView, ResultFile, UploadView
 from advtex_contract.options import JobOptions
 
@@ -64,6 +65,18 @@ class AsyncClient:
 
     async def close(self) -> None:
         await self._http.aclose()
+
+    async def ping(self) -> None:
+        """Raises a ClientError unless an advtex server answers."""
+        await self._run(calls.alive(), retries=0)
+
+    async def readiness(self) -> Readiness:
+        """Whether the server can accept work, and how each of its parts is."""
+        return await self._run(calls.readiness(), retries=0)
+
+    async def get_key(self) -> KeyView:
+        """What this client's key may do."""
+        return await self._run(calls.get_key(), retries=0)
 
     async def upload(self, scan: Path, *, on_bytes: OnBytes | None = None) -> UploadView:
         """Send a scan, zip or folder."""

@@ -29,12 +29,14 @@ from advtex_client._cli import (
     StepsOption,
     Url,
     command,
+    exit_code_of,
     job_options,
     parsed_size,
     retention,
 )
 from advtex_client._display import Display, finding_lines, job_lines, job_table
 from advtex_client.client import Client
+from advtex_client.doctor import examine
 from advtex_client.errors import ScanRejectedError
 from advtex_contract.jobs import TERMINAL, JobState, JobView
 from advtex_contract.options import Method, Preset
@@ -198,6 +200,19 @@ def delete(job: JobId, url: Url = None, api_key: ApiKey = None, as_json: AsJson 
     with command(as_json) as display, Client(url, api_key) as client:
         client.delete_job(job)
         display.data({"id": job, "deleted": True}, f"{job} deleted")
+
+
+@app.command()
+def doctor(url: Url = None, api_key: ApiKey = None, as_json: AsJson = False) -> None:
+    """Say what works and what does not: configuration, server, key, and the folder that remembers submissions."""
+    with command(as_json) as display, Client(url, api_key) as client:
+        found = list(examine(client))
+        codes = [exit_code_of(finding.error) for finding in found if finding.error is not None]
+        checks = [{"name": finding.name, "ok": finding.ok, "message": finding.message} for finding in found]
+        lines = [f"{'ok  ' if finding.ok else 'FAIL'} {finding.name}: {finding.message}" for finding in found]
+        display.data({"ok": not codes, "checks": checks}, "\n".join(lines))
+        if codes:
+            raise typer.Exit(codes[0])
 
 
 def main() -> None:

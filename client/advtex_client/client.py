@@ -21,6 +21,7 @@ from advtex_client.downloads import Download, OnFileBytes, is_there, target_path
 from advtex_client.errors import ClientError, NotFoundError
 from advtex_client.memory import SubmissionMemory, upload_alone
 from advtex_client.uploads import OnBytes, PackedScan, packed
+from advtex_contract.health import KeyView, Readiness
 from advtex_contract.jobs import BatchView, JobSpec, JobState, JobView, ResultFile, UploadView
 from advtex_contract.options import JobOptions
 
@@ -63,6 +64,18 @@ class Client:
 
     def close(self) -> None:
         self._http.close()
+
+    def ping(self) -> None:
+        """Raises a ClientError unless an advtex server answers."""
+        self._run(calls.alive(), retries=0)
+
+    def readiness(self) -> Readiness:
+        """Whether the server can accept work, and how each of its parts is."""
+        return self._run(calls.readiness(), retries=0)
+
+    def get_key(self) -> KeyView:
+        """What this client's key may do."""
+        return self._run(calls.get_key(), retries=0)
 
     def upload(self, scan: Path, *, on_bytes: OnBytes | None = None) -> UploadView:
         """Send a scan, zip or folder."""

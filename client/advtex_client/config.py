@@ -17,10 +17,13 @@ from advtex_client.errors import ConfigError
 
 @dataclass(frozen=True)
 class ClientConfig:
-    """Base URL of the server without a trailing slash, and the key (empty where the server asks for none)."""
+    """Base URL of the server without a trailing slash, and the key (empty where the server asks for none); and where
+    each was found."""
 
     url: str
     api_key: str
+    url_from: str = ""
+    api_key_from: str = ""
 
 
 def user_file() -> Path:
@@ -40,21 +43,23 @@ def load_config(url: str | None = None, api_key: str | None = None) -> ClientCon
     Order: arguments, ADVTEX_URL and ADVTEX_API_KEY, the user's TOML file, the embedded server's `client.json`.
     A key from a source that names no server fits any. Raises ConfigError.
     """
-    sources = [
-        {"url": url, "api_key": api_key},
-        {"url": os.environ.get("ADVTEX_URL"), "api_key": os.environ.get("ADVTEX_API_KEY")},
-        _read(user_file()),
-        _read(embedded_file()),
-    ]
-    base = next((source["url"] for source in sources if source["url"]), None)
+    sources = {
+        "the call": {"url": url, "api_key": api_key},
+        "the environment": {"url": os.environ.get("ADVTEX_URL"), "api_key": os.environ.get("ADVTEX_API_KEY")},
+        str(user_file()): _read(user_file()),
+        str(embedded_file()): _read(embedded_file()),
+    }
+    base, base_from = next(((found["url"], name) for name, found in sources.items() if found["url"]), (None, ""))
     if base is None:
         raise ConfigError(
             f"no server is configured; pass --url, set ADVTEX_URL, write `url` and `api_key` to {user_file()}, "
             f"or start one on this machine with `advtex-server up` (looked for {embedded_file()})"
         )
     base = _normalized(base)
-    fitting = (source["api_key"] for source in sources if not source["url"] or _normalized(source["url"]) == base)
-    return ClientConfig(base, next((key for key in fitting if key), ""))
+    for name, found in sources.items():
+        if found["api_key"] and (not found["url"] or _normalized(found["url"]) == base):
+            return ClientConfig(base, found["api_key"], base_from, name)
+    return ClientConfig(base, "", base_from)
 
 
 def _read(path: Path) -> dict[str, str | None]:

@@ -26,6 +26,15 @@ def upload_alone(server: str, sha256: str, folder: Path | None = None) -> Abstra
     return _locked(_folder(folder) / "uploads" / f"{place}.lock")
 
 
+def check_writable(folder: Path | None = None) -> Path:
+    """The folder of what is remembered; OSError if nothing can be written there."""
+    place = _folder(folder)
+    place.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=place) as file:
+        file.write(b"x")
+    return place
+
+
 class Submission(BaseModel):
     """How far a submission came. `salt` sets a job apart from earlier ones of the same scan and options."""
 

@@ -10,8 +10,10 @@ from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 
 import httpx
+from pydantic import BaseModel
 
 from advtex_contract.errors import ErrorBody, ErrorCode
+from advtex_contract.health import Alive, KeyView, PartView, Readiness
 from advtex_contract.jobs import JobSpec, JobState, JobView, Progress, ResultFile, UploadList, UploadView
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
@@ -34,14 +36,24 @@ class FakeServer:
         self.faults: list[Fault] = []
         self.script: list[JobView] = []
         self.events = False
+        self.readiness = Readiness(ready=True, checks={"database": PartView(ok=True, essential=True)})
+        self.key = KeyView(id="0123", scopes=["read", "write"], active_jobs=0, bytes=0)
         self.transport = httpx.MockTransport(self.handle)
 
     def handle(self, request: httpx.Request) -> httpx.Response:
-        body = request.read()
+        request.read()
         self.requests.append(request)
-        if self.faults:
-            return self.faults.pop(0)(request)
-        path = request.url.path
+        return self.faults.pop(0)(request) if self.faults else self.answer(request)
+
+    def answer(self, request: httpx.Request) -> httpx.Response:
+        """As it is meant to be; as a fault, it leaves one request alone."""
+        path, body = request.url.path, request.content
+        if path == "/healthz":
+            return ok(Alive())
+        if path == "/readyz":
+            return ok(self.readiness, 200 if self.readiness.ready else 503)
+        if path == "/v1/key":
+            return ok(self.key)
         if path == "/v1/uploads":
             return self._begin(request) if request.method == "POST" else self._find(request.url.params["sha256"])
         if match := re.fullmatch(r"/v1/uploads/(\w+)", path):
@@ -163,7 +175,7 @@ def view(job_id: str, state: JobState = JobState.queued, step: int = 0, **fields
     return JobView.model_validate({"id": job_id, "state": state, "progress": Progress(step=step)} | values)
 
 
-def ok(model: UploadView | UploadList | JobView, status: int = 200) -> httpx.Response:
+def ok(model: BaseModel, status: int = 200) -> httpx.Response:
     return httpx.Response(status, json=json.loads(model.model_dump_json()))
 
 

@@ -113,10 +113,11 @@ def _parser() -> argparse.ArgumentParser:
     compare = commands.add_parser("compare", help="score a result against the truth of a synthesized scan")
     compare.add_argument("model", type=Path, help="model.obj")
     compare.add_argument("scan", type=Path, help="the synthesized scan")
-    bench = commands.add_parser("bench", help="time one optimization step and its parts")
+    bench = commands.add_parser("bench", help="time one optimization step, on a crop of a view, and its parts")
     bench.add_argument("--device", default="auto")
-    bench.add_argument("--width", type=int, default=640)
-    bench.add_argument("--height", type=int, default=480)
+    bench.add_argument("--width", type=int, default=640, help="of the full frame in pixels; a step sees a crop of it")
+    bench.add_argument("--height", type=int, default=480, help="of the full frame in pixels")
+    bench.add_argument("--preset", default="paper", choices=PRESETS, help="decides the crop's size and the losses")
     bench.add_argument("--json", action="store_true", help="one line of JSON")
     return parser
 
@@ -196,7 +197,7 @@ def _compare(arguments: argparse.Namespace) -> int:
 def _bench(arguments: argparse.Namespace) -> int:
     from advtex_engine.bench import bench, print_table
 
-    result = bench(arguments.device, arguments.width, arguments.height)
+    result = bench(arguments.device, arguments.width, arguments.height, arguments.preset)
     if arguments.json:
         print(json.dumps(result))
     else:

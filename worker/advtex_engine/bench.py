@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from advtex_engine.batches import Batch
-from advtex_engine.config import PRESETS
+from advtex_engine.config import PRESETS, Preset
 from advtex_engine.discriminator import PatchDiscriminator
-from advtex_engine.optimize import AdversarialOptimizer, Losses, crop_size
+from advtex_engine.optimize import AdversarialOptimizer, Losses
 from advtex_engine.planar import planar_views
 from advtex_engine.views import Pairs, ViewMaps
 
@@ -85,16 +85,17 @@ class _Timed(_Full):
         self._time("texture update", super().update_texture, gradient)
 
 
-def bench(device_name: str, width: int, height: int) -> dict[str, Any]:
+def bench(device_name: str, width: int, height: int, preset_name: str) -> dict[str, Any]:
     """Median milliseconds of a step over STEPS steps, then the share of each part in as many more.
 
-    Every step updates the discriminator, so a real run, which skips some updates, is faster.
+    width, height: of the views, in pixels; a step, and so the FLOP count, is of the crop that the preset takes of
+    them. Every step updates both players, so a real run, which skips some of the discriminator's updates, is faster.
     """
     from advtex_engine.pipeline import choose_device
 
     device = choose_device(device_name)
     maps, pairs = planar_views(VIEWS, width, height, TEXELS_PER_PIXEL, device)
-    plain, timed = (_optimizer(kind, maps, pairs, device) for kind in (_Full, _Timed))
+    plain, timed = (_optimizer(kind, maps, pairs, PRESETS[preset_name], device) for kind in (_Full, _Timed))
     times = []
     for index in range(WARMUP + STEPS):
         started = time.perf_counter()
@@ -108,16 +109,16 @@ def bench(device_name: str, width: int, height: int) -> dict[str, Any]:
             timed.seconds.clear()
         timed.step()
     step_ms = sorted(times)[len(times) // 2] * 1e3
-    crop = crop_size(width, height)
-    flops = step_flops(*crop)
+    flops = step_flops(*plain.crop)
     whole = sum(timed.seconds.values())
     return {
         "device": device.type if device.type == "cpu" else torch.cuda.get_device_name(device),
         "threads": torch.get_num_threads(),
         "precision": "bf16" if plain.bfloat16 else "fp32",
+        "preset": preset_name,
         "width": width,
         "height": height,
-        "crop": list(crop),
+        "crop": list(plain.crop),
         "texels": maps.slots,
         "step_ms": round(step_ms, 3),
         "step_ms_least": round(min(times) * 1e3, 3),
@@ -128,19 +129,26 @@ def bench(device_name: str, width: int, height: int) -> dict[str, Any]:
 
 
 def print_table(result: dict[str, Any]) -> None:
-    """The same for people."""
+    """The same for people; sizes are in pixels."""
+    whole, crop = ("x".join(map(str, size)) for size in ((result["width"], result["height"]), result["crop"]))
+    print(f"preset {result['preset']}, crops of {crop} from full frames of {whole}")
     for key, value in result.items():
-        print(f"{key:32} {json.dumps(value)}")
+        if key not in ("preset", "width", "height", "crop"):
+            print(f"{key:32} {json.dumps(value)}")
 
 
-def _optimizer(kind: type[AdversarialOptimizer], maps: ViewMaps, pairs: Pairs, device: torch.device) -> Any:
+def _optimizer(
+    kind: type[AdversarialOptimizer], maps: ViewMaps, pairs: Pairs, preset: Preset, device: torch.device
+) -> AdversarialOptimizer:
+    """At the first step after the pretraining, in which the texture waits."""
     discriminator = PatchDiscriminator(torch.Generator().manual_seed(0)).to(device)
     generator = torch.Generator(device).manual_seed(0)
     start = torch.zeros((maps.slots, 3), device=device)
-    preset = PRESETS["paper"]
-    return kind(
+    optimizer = kind(
         maps, pairs, start, preset, kind="scene", steps=preset.steps, generator=generator, discriminator=discriminator
     )
+    optimizer.index = preset.pretraining
+    return optimizer
 
 
 def _wait(device: torch.device) -> None:

@@ -136,6 +136,13 @@ def test_triangle_soup_around_the_camera(seed: int) -> None:
     assert_agrees_with_embree(Mesh(mesh.v_pos, mesh.t_pos_idx[away]), looking((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)))
 
 
+def test_a_million_faces() -> None:
+    """Waves one behind the other, most faces smaller than a pixel."""
+    waves = grid(707, 707, height=3.0)
+    assert len(waves.t_pos_idx) == 999_698
+    assert_agrees_with_embree(waves, looking((20.0, -300.0, 60.0), (0.0, 0.0, 0.0)))
+
+
 @pytest.mark.parametrize("gap", [0.0, 1e-7, 1e-3])
 def test_planes_that_fight(gap: float) -> None:
     front, back = grid(7, 5), grid(7, 5)

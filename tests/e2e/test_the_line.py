@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import anyio
 import fake_engines
 import pytest
 from live_service import LiveService, wait_until
+from tiny_scan import HEIGHT, WIDTH, png, write_scan
 
 from advtex_client import AsyncClient, AuthError, JobFailedError, NotFoundError, ScanRejectedError
 from advtex_contract.jobs import JobSpec, JobState
@@ -86,6 +88,36 @@ def test_a_bad_scan_is_refused_before_it_is_sent_and_by_the_server_too(service: 
         with pytest.raises(ScanRejectedError) as caught:
             client.wait_for_job(job.id)
     assert any("mesh.ply" in detail.where + detail.message for detail in caught.value.details)
+
+
+def test_the_check_and_the_server_say_the_same(service: LiveService, tmp_path: Path) -> None:
+    folder = write_scan(tmp_path / "bad", frames=7)
+    scan = json.loads((folder / "scan.json").read_text())
+    scan["frames"][1]["camera_to_world"] = [[-math.inf] * 4] * 4
+    scan["frames"][2]["camera_to_world"][0][0] = 2.0
+    scan["frames"][3]["color"] = "color/gone.png"
+    del scan["mesh"]
+    (folder / "scan.json").write_text(json.dumps(scan))
+    cut, half = folder / "color/4.png", folder / "color/5.png"
+    cut.write_bytes(cut.read_bytes()[:-100])
+    half.write_bytes(png(WIDTH // 2, HEIGHT // 2, 0))
+    checked = service.run_client("check", str(folder), "--json")
+    assert checked.returncode == 4
+    findings = json.loads(checked.stdout)["findings"]
+    assert {(finding["severity"], finding["code"]) for finding in findings} >= {
+        ("error", "bad_pose"),
+        ("error", "missing_file"),
+        ("error", "no_mesh"),
+        ("error", "truncated_image"),
+        ("warning", "lost_tracking"),
+        ("warning", "color_scaled"),
+    }
+    with service.client() as client:
+        upload = client.upload(folder)  # as a client without the check would do
+        job = client.create_job(JobSpec(upload_id=upload.id), idempotency_key="k")
+    assert job.state is JobState.rejected
+    assert job.error is not None
+    assert [detail.model_dump() for detail in job.error.details] == findings
 
 
 def test_a_failed_job_says_why(service: LiveService, scan: Path) -> None:

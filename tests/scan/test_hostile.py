@@ -226,6 +226,59 @@ def test_cam_with_garbage(maker, make, cam, intrinsics):
     check(maker.folder())
 
 
+NUMBERS = ("nan", "-inf", "1e999", "-1e308", "1e-320", "-0", "0", "1", "-1", "0.5", "x", "1,0", "0x1p3", "\u0661")
+entries = st.sampled_from(NUMBERS[6:10]) | st.sampled_from(NUMBERS)  # mostly plain ones, so that whole matrices come
+poses = st.lists(entries, min_size=9, max_size=20) | st.lists(entries, min_size=16, max_size=16)
+IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
+
+
+def lines_of(words: list[str], columns: int) -> bytes:
+    return "\n".join(" ".join(words[at : at + columns]) for at in range(0, len(words), columns)).encode()
+
+
+@RELAXED
+@given(poses, st.integers(3, 16))
+def test_scannet_poses_of_any_numbers(maker, make, words, columns):
+    maker.files = {f"color/{i}.png": make.png() for i in range(4)}
+    maker.files |= {f"pose/{i}.txt": IDENTITY.encode() for i in range(4)} | {"pose/1.txt": lines_of(words, columns)}
+    maker.files["intrinsic/intrinsic_color.txt"] = b"30 0 16 0 0 30 12 0 0 0 1 0 0 0 0 1"
+    check(maker.folder())
+
+
+@RELAXED
+@given(poses, st.integers(3, 16), st.sampled_from(["frame-000001.pose.txt", "depth-to-color.txt"]))
+def test_seven_scenes_poses_of_any_numbers(maker, make, words, columns, name):
+    maker.files = {f"frame-00000{i}.color.png": make.png() for i in range(4)}
+    maker.files |= {f"frame-00000{i}.pose.txt": IDENTITY.encode() for i in range(4)}
+    maker.files["camera-intrinsics.txt"] = b"30 0 16\n0 30 12\n0 0 1"
+    maker.files[name] = lines_of(words, columns)
+    check(maker.folder())
+
+
+@RELAXED
+@given(poses, st.lists(entries, min_size=1, max_size=7))
+def test_cam_poses_of_any_numbers(maker, make, words, second):
+    maker.files = {f"color_{i}.png": make.png() for i in range(4)}
+    maker.files |= {f"color_{i}.cam": b"0 0 0 1 0 0 0 1 0 0 0 1\n1 0 0 1 0.5 0.5" for i in range(4)}
+    maker.files["color_1.cam"] = lines_of(words[:12], 12) + b"\n" + " ".join(second).encode()
+    check(maker.folder())
+
+
+floats = st.sampled_from([0.0, -0.0, 1.0, -1.0, 0.5, 3.4e38, 1e-45, math.nan, math.inf, -math.inf])
+
+
+@RELAXED
+@given(st.lists(floats | st.just(0.0), min_size=16, max_size=16), st.lists(floats, min_size=16, max_size=16))
+def test_a_sens_with_any_floats_as_poses_and_cameras(tmp_path, pose, camera):
+    data = struct.pack("<IQ", 4, 3) + b"abc" + struct.pack("<16f", *camera) + struct.pack("<48f", *[30.0] * 48)
+    data += struct.pack("<2i4IfQ", 0, 0, 2, 2, 2, 2, 1000.0, 3)
+    for _ in range(3):
+        data += struct.pack("<16f4Q", *pose, 0, 0, 12, 8) + bytes(20)
+    (tmp_path / "a.sens").write_bytes(data)
+    with bounded_memory():
+        check(tmp_path)
+
+
 angles = st.floats(-math.pi, math.pi)
 
 

@@ -13,13 +13,13 @@ import typer
 
 from advtex_server.embedded import SetupError
 from advtex_server.health import checks
-from advtex_server.logs import configure_logs
 from advtex_server.serving import serve as run_server
 from advtex_server.serving import up as run_all
 from advtex_server.settings import ServerSettings
 from advtex_store.accounts import SCOPES, Accounts
 from advtex_store.database import Database, upgrade_database
 from advtex_store.errors import RecordNotFound
+from advtex_store.logs import configure_logs
 from advtex_store.store import open_store
 
 app = typer.Typer(

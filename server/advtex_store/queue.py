@@ -47,6 +47,12 @@ def class_of(memory_bytes: int) -> int:
     return memory_bytes // GIB
 
 
+def attempt_of(rq_id: str) -> tuple[str, int]:
+    """(job, attempt) of what a worker has taken."""
+    job_id, _, attempt = rq_id.rpartition("-")
+    return job_id, int(attempt)
+
+
 def queue_name(gib: int) -> str:
     return f"{QUEUE}{gib}"
 

@@ -19,7 +19,8 @@ from rq import Worker
 from rq.exceptions import StopRequested
 from rq.serializers import JSONSerializer
 
-from advtex_store.queue import JobQueue, class_of, connect_redis, queue_name
+from advtex_store.logs import configure_logs
+from advtex_store.queue import JobQueue, attempt_of, class_of, connect_redis, queue_name
 from advtex_worker.memory import usable_memory
 from advtex_worker.parentage import die_with_parent
 from advtex_worker.settings import WorkerSettings
@@ -77,6 +78,12 @@ class JobWorker(Worker):
         else:
             raise StopRequested
 
+    def execute_job(self, job: Any, queue: Any) -> None:
+        """The work-horse inherits the context: its lines and RQ's own name the job in both processes."""
+        job_id, attempt = attempt_of(job.id)
+        with structlog.contextvars.bound_contextvars(job=job_id, attempt=attempt):
+            super().execute_job(job, queue)
+
     def fork_work_horse(self, job: Any, queue: Any) -> None:
         """Signals wait until both processes know which one they are."""
         signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
@@ -129,11 +136,7 @@ def main() -> None:
         settings = WorkerSettings()
     except ValidationError as error:
         sys.exit(f"advtex-worker: the configuration is wrong: {error}")
-    level = logging.getLevelNamesMapping()[settings.log_level]
-    structlog.configure(
-        wrapper_class=structlog.make_filtering_bound_logger(level),
-        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
-    )
+    configure_logs(logging.getLevelNamesMapping()[settings.log_level])
     log.info("worker begins", device=settings.device, threads=settings.threads)
     work(Host(settings))
     log.info("worker ends")

@@ -10,7 +10,7 @@ from structlog.typing import Processor
 
 
 def configure_logs(level: int = logging.INFO) -> None:
-    """For the whole process, uvicorn's and alembic's logs included."""
+    """For the whole process, the logs of uvicorn, alembic and RQ included."""
     shared: list[Processor] = [
         structlog.contextvars.merge_contextvars,
         structlog.stdlib.add_logger_name,

@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 import httpx
 import psutil
 import pytest
-from cutting_proxy import CuttingProxy
+from cutting_proxy import BUFFER, CuttingProxy
 from live_service import LiveService, wait_until
 
 from advtex_client import Client
@@ -25,7 +25,8 @@ from advtex_store import keys
 
 MB = 1_000_000
 TUS = {"Tus-Resumable": "1.0.0"}
-ON_THE_LINE = 6 * MB  # what a cut takes with it: buffers of four sockets, and the rounding of the count
+ON_THE_LINE = 3 * MB  # what a cut takes with it at most: the buffers on the way, and the rounding of the count
+MOST_RESENT = 0.05
 
 
 def sparse(path: Path, size: int) -> Path:
@@ -55,8 +56,8 @@ class Sent:
         self._watch()
 
 
-def over_a_line_that_is_cut(service: LiveService, tmp_path: Path, size: int, least: int, most: int) -> float:
-    """-> which share of the file was sent again."""
+def over_a_line_that_is_cut(service: LiveService, tmp_path: Path, size: int, least: int, most: int) -> None:
+    """Every byte arrives, few are sent twice, and the server holds few of them in memory."""
     archive = sparse(tmp_path / "scan.zip", size)
     server = psutil.Process(service.server.pid)
     with service.client() as client:
@@ -68,7 +69,10 @@ def over_a_line_that_is_cut(service: LiveService, tmp_path: Path, size: int, lea
         peak = max(peak, server.memory_info().rss)
 
     sent = Sent(look)
-    with CuttingProxy(service.url, 1, least, most) as proxy, Client(proxy.url, service.key) as client:
+    # Between two processes of one machine Linux grows the sender's buffer to megabytes, all lost with a cut; few real
+    # lines hold so much. With the proxy's own size, what is sent again is what client and server are to blame for.
+    line = httpx.HTTPTransport(socket_options=[(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER)])
+    with CuttingProxy(service.url, 1, least, most) as proxy, Client(proxy.url, service.key, transport=line) as client:
         began = time.monotonic()
         upload = client.upload(archive, on_bytes=sent)
         seconds = time.monotonic() - began
@@ -81,18 +85,17 @@ def over_a_line_that_is_cut(service: LiveService, tmp_path: Path, size: int, lea
     assert upload.sha256 == digest(archive)
     assert digest(stored) == upload.sha256
     assert proxy.cuts >= 3
-    assert 0 <= resent * size <= proxy.cuts * ON_THE_LINE
+    assert 0 <= resent * size <= min(proxy.cuts * ON_THE_LINE, size * MOST_RESENT)
     assert peak - before < 64 * MB
-    return resent
 
 
 def test_a_line_that_is_cut_again_and_again(service: LiveService, tmp_path: Path) -> None:
-    over_a_line_that_is_cut(service, tmp_path, 200 * MB, 25 * MB, 60 * MB)
+    over_a_line_that_is_cut(service, tmp_path, 200 * MB, 40 * MB, 60 * MB)
 
 
 @pytest.mark.soak
 def test_two_gigabytes_over_a_line_that_is_cut(service: LiveService, tmp_path: Path) -> None:
-    assert over_a_line_that_is_cut(service, tmp_path, 2000 * MB, 20 * MB, 400 * MB) <= 0.05
+    over_a_line_that_is_cut(service, tmp_path, 2000 * MB, 20 * MB, 400 * MB)
 
 
 def begun(service: LiveService, size: int) -> str:

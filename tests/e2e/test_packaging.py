@@ -266,6 +266,22 @@ class TestDemo:
             start_new_session=True,
         )
 
+    def test_it_prints_what_it_made_and_leaves_no_process(self, folder: Path) -> None:
+        with self.start(folder, write_zip(folder / "scan.zip", write_scan(folder / "scan"))) as demo:
+            assert demo.stdout is not None
+            said, processes = [], set[int]()
+            for line in demo.stdout:
+                said.append(line)
+                processes |= set(process_tree(demo.pid))
+            assert demo.wait(60) == 0, "".join(said)
+        assert len(processes) > 5
+        wait_until(lambda: not any(psutil.pid_exists(pid) for pid in processes))
+        paths = [folder / line.split()[-1] for line in said[-3:]]
+        names = ["model.glb", "model.obj", "comparison.png"]
+        assert [path.name for path in paths] == names, "".join(said)
+        assert all(path.stat().st_size > 50 for path in paths)
+        assert sorted(path.name for path in (folder / "demo").iterdir()) == ["result", "service.log"]
+
     def test_ctrl_c_stops_everything(self, folder: Path) -> None:
         with self.start(folder, write_zip(folder / "scan.zip", write_scan(folder / "scan"))) as demo:
             assert demo.stdout is not None

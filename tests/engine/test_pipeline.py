@@ -184,7 +184,7 @@ def test_a_terminated_run_leaves_a_checkpoint_and_its_exit_code_says_so(scan: Pa
 @pytest.mark.slow
 def test_saving_takes_little_of_a_small_run(scan: Path, tmp_path: Path) -> None:
     """Checkpoints come as often as their share of the time lets them: nothing else bounds them here."""
-    config = TextureConfig(preset="preview", steps=300, face_budget=4000, device="cpu", checkpoint_seconds=0.01)
+    config = TextureConfig(preset="preview", steps=600, face_budget=4000, device="cpu", checkpoint_seconds=0.01)
     recorder = Checkpointed()
     report = texture_scan(scan, tmp_path, config, work=tmp_path / "work", monitor=recorder).report
     assert recorder.checkpoints > 0

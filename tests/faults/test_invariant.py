@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import threading
 import time
@@ -45,6 +46,13 @@ def distributed(tmp_path: Path, small_disk: Path | None, postgres_url: str, s3_u
     """PostgreSQL and S3; spool and workspaces on a small disk."""
     s3 = {name: value for name, value in os.environ.items() if name.startswith("AWS_")}
     return Place((small_disk or tmp_path) / "data", postgres_url, s3_url, s3, ballast=small_disk)
+
+
+def test_a_disk_can_be_filled_here(small_disk: Path | None) -> None:
+    """So that a summary without a skip means that the schedules below had all their faults."""
+    if small_disk is None:
+        pytest.skip("a small tmpfs cannot be mounted here (it takes root): no schedule of faults fills a disk")
+    assert shutil.disk_usage(small_disk).total == 64 << 20
 
 
 @pytest.mark.slow

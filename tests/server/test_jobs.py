@@ -13,6 +13,7 @@ import pytest
 
 from advtex_contract.jobs import JobError, JobPage, JobView, Progress
 from advtex_store.errors import StaleAttempt
+from advtex_store.needs import needed_memory
 
 
 def lasting(view: dict[str, Any]) -> dict[str, Any]:
@@ -29,6 +30,7 @@ def test_a_good_scan_is_queued(live: Any, scan_zip: Path) -> None:
     job = JobView.model_validate_json(response.content)
     assert response.headers["location"] == f"/v1/jobs/{job.id}"
     assert (job.state, job.attempt, job.label, job.options.preset) == ("queued", 0, "chair", "preview")
+    assert job.memory_bytes == needed_memory(job.options, views=5, width=32, height=24)
     assert lasting(live.http.get(f"/v1/jobs/{job.id}").json()) == lasting(response.json())
 
 

@@ -73,8 +73,13 @@ def submit(
     with command(as_json) as display, Client(url, api_key) as client:
         width, height = parsed_size(size)
         options = job_options(preset=preset, method=method, width=width, height=height, holdout=holdout, steps=steps)
-        run = BatchRun(place=scans.absolute(), by_reference=by_reference, options=options, priority=priority)
-        run.retention_seconds = retention(keep_days)
+        run = BatchRun(
+            place=scans.absolute(),
+            by_reference=by_reference,
+            options=options,
+            priority=priority,
+            retention_seconds=retention(keep_days),
+        )
         _submit(client, display, batch or _id_from(scans), run, wait, timeout)
 
 

@@ -1,5 +1,6 @@
 """Scans, checkpoints and results: a local folder, or an S3 bucket through obstore.
 
+The folder is our own code because obstore's is not durable: its put renames, and calls no fsync at all (strace, 0.12).
 Nothing is ever half there: a blob is written aside, made durable (fsync of file and folders, or a completed multipart
 upload) and only then gets its name. Bytes pass in chunks; no blob is ever whole in memory except through `get`.
 Names are in `keys.py`. All calls block; the server makes them in threads.
@@ -23,7 +24,7 @@ from urllib.parse import unquote, urlsplit
 
 from advtex_store.errors import BlobNotFound, BlobsUnavailable
 from advtex_store.files import fsync_dir, translated
-from advtex_store.partials import FolderPartial, Partial, PublishedPartial
+from advtex_store.partials import FolderPartial, Partial, PublishedPartial, Unpublished
 
 CHUNK = 1 << 20
 PLACE_ATTEMPTS = 100
@@ -138,6 +139,15 @@ class Blobs(ABC):
     @abstractmethod
     def drop_partial(self, key: str) -> None:
         """Remove the pieces of a blob that was never published; no error if there are none."""
+
+    def unpublished(self, prefix: str) -> Iterator[Unpublished]:
+        """Multipart uploads below a prefix that ends in `/`. They are no blobs, and kept until they are aborted."""
+        check_prefix(prefix)
+        return iter(())
+
+    def abort(self, found: Unpublished) -> None:
+        """Drop the parts of a multipart upload; no error if there are none."""
+        raise NotImplementedError(f"{type(self).__name__} has no multipart uploads")
 
     def is_published(self, key: str, size: int) -> bool:
         """Whether the whole blob is there."""

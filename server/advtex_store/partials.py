@@ -9,12 +9,22 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from advtex_store.errors import BlobNotFound
 from advtex_store.files import fsync_dir, translated
+
+
+@dataclass(frozen=True, slots=True)
+class Unpublished:
+    """A multipart upload that was begun and not completed. `superseded`: another one has taken its place for good."""
+
+    key: str
+    upload_id: str
+    superseded: bool
 
 
 class Partial(ABC):

@@ -96,12 +96,37 @@ class Retention:
                 ids = found[start : start + BATCH]
                 with self.database.read() as session:
                     alive = set(session.scalars(select(table.id).where(table.id.in_(ids), table.purged_at.is_(None))))
-                for orphan in set(ids) - alive:
+                for orphan in (found_id for found_id in ids if found_id not in alive):
                     if table is UploadRow:
                         self.blobs.drop_partial(keys.scan_key(orphan))
                     self.blobs.delete_prefix(f"{prefix}{orphan}/")
                     swept += 1
+        return swept + self._sweep_multiparts(keys.SCANS, UploadRow) + self._sweep_multiparts(keys.JOBS, JobRow)
+
+    def _sweep_multiparts(self, prefix: str, table: type[JobRow] | type[UploadRow]) -> int:
+        """Abort multipart uploads whose writers died: of rows that are gone or need no more bytes, and those that
+        another one has taken the place of. -> how many
+
+        A writer that begins one this moment has its row, which is looked at later. All rows end, so in the end nothing
+        is left.
+        """
+        swept = 0
+        for found in list(self.blobs.unpublished(prefix)):
+            row_id = found.key.removeprefix(prefix).partition("/")[0]
+            if ID.fullmatch(row_id) and (found.superseded or not self._needs_bytes(table, row_id)):
+                self.blobs.abort(found)
+                swept += 1
         return swept
+
+    def _needs_bytes(self, table: type[JobRow] | type[UploadRow], row_id: str) -> bool:
+        with self.database.read() as session:
+            if table is UploadRow:
+                upload = session.get(UploadRow, row_id)
+                return upload is not None and upload.purged_at is None and upload.sha256 is None
+            job = session.get(JobRow, row_id)
+            if job is None or job.purged_at is not None:
+                return False
+            return job.finished_at is None or self.database.now(session) - job.finished_at < SETTLED_SECONDS
 
     def _done(self, table: type[JobRow] | type[UploadRow], row_id: str) -> None:
         with self.database.write() as session:

@@ -13,7 +13,7 @@ from obstore.store import S3Store
 
 from advtex_store.blobs import BlobInfo, Blobs, check_key, check_prefix
 from advtex_store.errors import BlobNotFound, BlobsUnavailable
-from advtex_store.partials import Partial, PublishedPartial
+from advtex_store.partials import Partial, PublishedPartial, Unpublished
 from advtex_store.s3_partial import MULTIPART_SUFFIX, S3Multipart, S3Partial
 
 PART = 8 << 20  # bytes per part of a multipart upload and per read
@@ -78,6 +78,21 @@ class S3Blobs(Blobs):
         for info in self.list(key.rpartition("/")[0] + "/"):
             if info.key.startswith(f"{key}."):
                 self.delete(info.key)
+
+    def unpublished(self, prefix: str) -> Iterator[Unpublished]:
+        check_prefix(prefix)
+        for key, upload_id in self._multipart.begun(prefix):
+            try:
+                marked = self.get(key + MULTIPART_SUFFIX).decode()
+            except BlobNotFound:
+                marked = upload_id  # may be written this moment
+            except ValueError:
+                continue  # somebody else's name
+            yield Unpublished(key, upload_id, superseded=marked != upload_id)
+
+    def abort(self, found: Unpublished) -> None:
+        with suppress(BlobNotFound):
+            self._multipart.abort(found.key, found.upload_id)
 
     def check(self) -> None:
         with self._existing_bucket():

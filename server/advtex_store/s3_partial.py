@@ -70,6 +70,15 @@ class S3Multipart:
                 **self._named(key), UploadId=upload_id, MultipartUpload={"Parts": chosen}
             )
 
+    def begun(self, prefix: str) -> list[tuple[str, str]]:
+        """Key and id of every multipart upload below the prefix that was neither completed nor aborted."""
+        with _translated(prefix):
+            pages = self._client.get_paginator("list_multipart_uploads").paginate(
+                Bucket=self._bucket, Prefix=self._prefix + prefix
+            )
+            found = [upload for page in pages for upload in page.get("Uploads", [])]
+        return [(upload["Key"].removeprefix(self._prefix), upload["UploadId"]) for upload in found]
+
     def abort(self, key: str, upload_id: str) -> None:
         """Drop all parts. BlobNotFound if that was done before."""
         with _translated(key):

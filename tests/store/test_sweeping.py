@@ -13,12 +13,13 @@ from hypothesis import strategies as st
 
 from advtex_contract.jobs import JobSpec
 from advtex_store import keys
-from advtex_store.blobs import Blobs, FolderBlobs
+from advtex_store.blobs import Blobs, FolderBlobs, open_blobs
 from advtex_store.errors import StoreError
 from advtex_store.ids import new_id
 from advtex_store.models import JobRow, UploadRow
 from advtex_store.results import Results
 from advtex_store.retention import SETTLED_SECONDS, Retention
+from advtex_store.s3 import S3Blobs
 
 
 class World:
@@ -154,6 +155,33 @@ def test_sweeping_never_removes_what_a_row_refers_to(sqlite_bench: Any, data: st
                 world.check()
             world.retention.sweep()
             world.check()
+
+
+def test_multipart_uploads_whose_writers_died_are_aborted(bench: Any, s3_url: str, tmp_path: Path) -> None:
+    blobs = open_blobs(s3_url, tmp_path)
+    assert isinstance(blobs, S3Blobs)
+    retention = Retention(bench.database, blobs)
+    begun, complete, job = bench.uploads.create("me", 5000).id, bench.finished_upload(), bench.job()
+    create = blobs._multipart.create
+    kept = [create(keys.scan_key(begun)), create(keys.result_key(job, 1, "a")), create("scans/by hand/x")]
+    for key in (keys.scan_key(new_id(bench.clock.now)), keys.scan_key(complete)):
+        create(key)
+
+    def left() -> list[str]:
+        begun = blobs._multipart.begun(keys.SCANS) + blobs._multipart.begun(keys.JOBS)
+        return sorted(upload_id for _, upload_id in begun)
+
+    assert retention.sweep() == 2
+    assert left() == sorted(kept), "a writer may have begun them this moment"
+    blobs.resume(keys.scan_key(begun), 5000, 0).close()  # the client tries again
+    assert retention.sweep() == 1
+    assert kept[0] not in left()
+    assert len(left()) == 3
+    bench.records.cancel(job)
+    assert retention.sweep() == 0, "an attempt that was canceled may still be at it"
+    bench.clock.now += SETTLED_SECONDS + 1
+    assert retention.sweep() == 1
+    assert kept[1] not in left()
 
 
 def test_orphans_go_and_everything_else_stays(bench: Any, blobs: Blobs) -> None:

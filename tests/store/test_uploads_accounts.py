@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
 from sqlalchemy import text
 
+from advtex_contract.jobs import JobSpec
 from advtex_store.errors import IllegalTransition, QuotaExceeded, RecordNotFound, Superseded
 
 
@@ -54,6 +57,31 @@ def test_the_quota_counts_what_is_kept_and_what_is_on_its_way(bench: Any) -> Non
         bench.uploads.create("me", 1, max_bytes=100)
     bench.uploads.delete(row.id)
     bench.uploads.create("me", 60, max_bytes=100)
+
+
+def at_once(action: Callable[[], object], callers: int) -> int:
+    """-> how many of them were not refused by the quota"""
+
+    def attempt(_: int) -> bool:
+        try:
+            action()
+        except QuotaExceeded:
+            return False
+        return True
+
+    with ThreadPoolExecutor(callers) as pool:
+        return sum(pool.map(attempt, range(callers)))
+
+
+def test_uploads_at_once_do_not_exceed_the_quota(bench: Any) -> None:
+    bench.accounts.create_key("k", owner="me")
+    assert at_once(lambda: bench.uploads.create("me", 40, max_bytes=100), 8) == 2
+
+
+def test_jobs_at_once_do_not_exceed_the_quota(bench: Any) -> None:
+    bench.accounts.create_key("k", owner="me")
+    spec = JobSpec(upload_id=bench.finished_upload("me"))
+    assert at_once(lambda: bench.submissions.create_job("me", spec, max_active_jobs=3), 8) == 3
 
 
 def test_an_upload_that_is_not_admitted_leaves_no_row(bench: Any) -> None:

@@ -27,14 +27,13 @@ class WorkFolder:
 
     save: atomic and durable, then reported to the monitor; OSError when the disk is full. load: None when absent,
     unreadable or of another run.
-    seconds: spent in `save` so far. started: when this attempt began (time.monotonic). earlier_seconds: what attempts
-    before it spent on the optimization, as far as the checkpoint that was loaded goes.
+    seconds: spent in `save` so far. earlier_seconds: what attempts before this one spent on the optimization, as far
+    as the checkpoint that was loaded goes.
     """
 
     def __init__(self, path: Path, fingerprint: str, monitor: Monitor) -> None:
         self.path, self.fingerprint, self.monitor = path, fingerprint, monitor
         self.seconds = self.earlier_seconds = 0.0
-        self.started = time.monotonic()
         path.mkdir(parents=True, exist_ok=True)
 
     def save(self, name: str, content: Mapping[str, Any]) -> None:
@@ -86,13 +85,13 @@ class _Watched:
 class Checkpoints:
     """The checkpoint of a run's optimization; made at its start, loaded, and then saved from time to time.
 
-    The next one is due every `seconds`, and later while saving, the stage caches included, has taken more than
-    MAX_SHARE of the attempt's time.
+    The next one is due every `seconds`, and later while checkpoints have taken more than MAX_SHARE of the time.
     """
 
     def __init__(self, work: WorkFolder, seconds: float) -> None:
         self.work, self.seconds = work, seconds
         self._started = self._last = time.monotonic()
+        self._saving = 0.0
 
     def load(self) -> dict[str, Any] | None:
         """What `save` was given, of the work folder's checkpoint; None without one."""
@@ -103,11 +102,13 @@ class Checkpoints:
 
     def due(self) -> bool:
         now = time.monotonic()
-        in_share = self.work.seconds <= MAX_SHARE * (now - self.work.started)
+        in_share = self._saving <= MAX_SHARE * (now - self._started)
         return in_share and now >= self._last + self.seconds
 
     def save(self, content: Mapping[str, Any]) -> None:
         """Replaces the checkpoint; beside `content` it holds what all attempts have spent on the optimization."""
-        seconds = self.work.earlier_seconds + time.monotonic() - self._started
+        before = time.monotonic()
+        seconds = self.work.earlier_seconds + before - self._started
         self.work.save(CHECKPOINT, {"seconds": seconds, **content})
         self._last = time.monotonic()
+        self._saving += self._last - before

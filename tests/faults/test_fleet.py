@@ -3,39 +3,71 @@
 from __future__ import annotations
 
 import itertools
+import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
+import boto3
 import pytest
 from chaos import check_outcome, insist
 from fleet import Place, fleet, kill_tree
 from live_service import wait_until
 from tiny_scan import write_zip
 
+from advtex_store.models import JobRow
+
 SCENES = 30
 STEPS = 40
+
+
+def write_manifest(folder: Path, bucket: str, scan: Path) -> Path:
+    """The same scan as many scenes: half of them files beside the manifest, half of them objects."""
+    folder.mkdir()
+    name, prefix = bucket.removeprefix("s3://").split("/")
+    objects = boto3.client("s3", endpoint_url=os.environ["AWS_ENDPOINT_URL"])
+    data = write_zip(folder / "scene.zip", scan).read_bytes()
+    rows = []
+    for number in range(SCENES):
+        path = f"scene-{number:02}.zip"
+        if number % 2:
+            objects.put_object(Bucket=name, Key=f"{prefix}/{path}", Body=data)
+            path = f"{bucket}/{path}"
+        else:
+            (folder / path).write_bytes(data)
+        seed = 20 * number  # none of those that the engine treats in a way of their own
+        rows.append({"path": path, "options": {"seed": seed, "steps": STEPS}})
+    manifest = folder / "night.jsonl"
+    manifest.write_text("\n".join(map(json.dumps, rows)))
+    return manifest
+
+
+def submit(manifest: Path, url: str, key: str, home: Path) -> None:
+    """As a user does, who has sent nothing when it is done."""
+    command = [sys.executable, "-m", "advtex_client.cli", "batch", "submit", str(manifest), "--by-reference"]
+    environment = {**os.environ, "HOME": str(home), "XDG_STATE_HOME": str(home), "XDG_CONFIG_HOME": str(home)}
+    environment |= {"ADVTEX_URL": url, "ADVTEX_API_KEY": key}
+    done = subprocess.run([*command, "--id", "night"], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.slow
 def test_a_batch_finishes_while_its_workers_are_killed(
     tmp_path: Path, scan: Path, postgres_url: str, s3_url: str
 ) -> None:
-    scenes = tmp_path / "scenes"
-    scenes.mkdir()
-    first = write_zip(scenes / "scene-00.zip", scan)
-    for number in range(1, SCENES):
-        (scenes / f"scene-{number:02}.zip").write_bytes(first.read_bytes())
+    bucket = "s3://" + s3_url.split("/")[2]
+    manifest = write_manifest(tmp_path / "scenes", f"{bucket}/scans", scan)
     s3 = {name: value for name, value in os.environ.items() if name.startswith("AWS_")}
     place = Place(tmp_path / "data", postgres_url, s3_url, s3)
-    roots = {"ADVTEX_REFERENCE_ROOTS": scenes.as_uri()}
+    roots = {"ADVTEX_REFERENCE_ROOTS": f"{manifest.parent.as_uri()} {bucket}/scans"}
     with fleet(tmp_path, place, workers=3, engine="journaled", variables=roots) as running:
         key = running.store.accounts.create_key("fleet", owner="fleet")
-        jobs = {}
-        for number, path in enumerate(sorted(scenes.iterdir())):
-            seed = 20 * number  # none of those that the engine treats in a way of their own
-            body = {"source": path.as_uri(), "batch": "night", "options": {"seed": seed, "steps": STEPS}}
-            answer = insist(running, key, "POST", "/v1/jobs", json=body, headers={"Idempotency-Key": path.name})
-            jobs[answer.json()["id"]] = ("fleet", seed, STEPS)
+        submit(manifest, running.urls[0], key, tmp_path / "home")
+        with running.store.database.read() as session:
+            rows = list(session.query(JobRow))
+        assert sum(row.source.startswith("s3://") for row in rows) == SCENES // 2
+        jobs = {row.id: ("fleet", row.options["seed"], STEPS) for row in rows}
 
         def succeeded() -> int:
             return running.store.records.count_by_state().get("succeeded", 0)

@@ -134,6 +134,20 @@ def test_metrics_of_the_fleet(make_live: Callable[..., Any], redis_url: str, sca
     assert 'advtex_jobs_ended_total{state="succeeded"} 1.0' in told
 
 
+def test_readyz_tells_of_workers_that_pause(make_live: Callable[..., Any], redis_url: str, scan_zip: Path) -> None:
+    live = make_live(redis_url=redis_url)
+    job = live.job(live.upload(scan_zip.read_bytes()))["id"]
+    live.store.queue.announce("w", 8)
+    live.store.records.claim(job, 1, "w")
+    for reason in ("the disk of its worker is full", ""):
+        live.store.records.heartbeat(job, 1, waiting_reason=reason)
+        ready = live.http.get("/readyz")
+        workers = ready.json()["checks"]["workers"]
+        assert (ready.status_code, workers["ok"]) == (200, not reason)
+        assert reason in workers["message"]
+        assert live.http.get(f"/v1/jobs/{job}").json()["waiting_reason"] == reason
+
+
 @pytest.mark.parametrize(
     ("header", "size", "span"),
     [

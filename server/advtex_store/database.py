@@ -17,6 +17,7 @@ from sqlalchemy.orm import Session
 # A cut line is noticed in seconds, and what it left open is given up: rows that it had locked would block everybody.
 POSTGRES_LINE = {"connect_timeout": 5, "tcp_user_timeout": 10_000, "keepalives_idle": 10, "keepalives_interval": 5}
 POSTGRES_LIMITS = "-c statement_timeout=30s -c lock_timeout=15s -c idle_in_transaction_session_timeout=20s"
+SQLITE_POOL = 40
 MIGRATION_LOCK = 0x61647674  # any constant that only this service uses as a PostgreSQL advisory lock
 
 
@@ -68,7 +69,8 @@ def connect(url: str, limits: str = "") -> Engine:
         return create_engine(url, pool_pre_ping=True, pool_size=10, max_overflow=20, connect_args=arguments)
     if folder := make_url(url).database:
         Path(folder).parent.mkdir(parents=True, exist_ok=True)
-    engine = create_engine(url, connect_args={"timeout": 30})
+    # As many as a server has threads: opening a connection takes longer than a request, and they cost little when idle.
+    engine = create_engine(url, pool_size=SQLITE_POOL, connect_args={"timeout": 30})
     event.listen(engine, "connect", _prepare_sqlite)
     event.listen(engine, "begin", _begin_sqlite)
     return engine

@@ -86,16 +86,18 @@ class Line:
             pass
 
 
-async def poll(line: Line, path: str, until: float, start: float, times: list[float]) -> None:
-    await asyncio.sleep(start)
-    while (began := time.perf_counter()) < until:
+async def poll(line: Line, path: str, begin: float, until: float, times: list[float]) -> None:
+    """Once a second, beginning at `begin`: a late answer must not let the pollers fall into step."""
+    due = begin
+    while due < until:
+        await asyncio.sleep(max(0.0, due - time.perf_counter()))
+        began = time.perf_counter()
         await line.request("GET", path)
         times.append(time.perf_counter() - began)
-        await asyncio.sleep(max(0.0, 1.0 - (time.perf_counter() - began)))
+        due += 1.0
 
 
-async def upload(line: Line, until: float, sizes: list[int]) -> None:
-    body = os.urandom(UPLOAD_BYTES)
+async def upload(line: Line, body: bytes, until: float, sizes: list[int]) -> None:
     while time.perf_counter() < until:
         began = time.perf_counter()
         await line.request("POST", "/v1/uploads", body, pieces=100)
@@ -122,13 +124,19 @@ async def measure(load: Load, port: int, key: str, job: str, server: psutil.Proc
     asking: list[float] = []
     sizes: list[int] = []
     listing: list[float] = []
+    bodies = [os.urandom(UPLOAD_BYTES) for _ in range(load.uploads)]
     path = f"/v1/jobs/{job}"
+    await lines[0].request("GET", path)  # a server's very first answer takes long
     spent = sum(server.cpu_times()[:2])
-    until = time.perf_counter() + load.seconds
+    begin = time.perf_counter() + 0.1
+    until = begin + load.seconds
     streaming = load.pollers + load.streams
     listeners = [asyncio.create_task(line.listen(f"{path}/events")) for line in lines[load.pollers : streaming]]
-    pollers = [poll(line, path, until, n / load.pollers, asking) for n, line in enumerate(lines[: load.pollers])]
-    await asyncio.gather(*pollers, *(upload(line, until, sizes) for line in lines[streaming:-1]))
+    pollers = [
+        poll(line, path, begin + n / load.pollers, until, asking) for n, line in enumerate(lines[: load.pollers])
+    ]
+    uploads = [upload(line, body, until, sizes) for line, body in zip(lines[streaming:-1], bodies, strict=True)]
+    await asyncio.gather(*pollers, *uploads)
     spent = sum(server.cpu_times()[:2]) - spent
     for task in listeners:
         task.cancel()

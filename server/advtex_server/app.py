@@ -15,6 +15,7 @@ from advtex_server.bodies import OpenBodies
 from advtex_server.deliveries import Deliverer
 from advtex_server.dispatch import Dispatcher
 from advtex_server.doorkeeper import Doorkeeper
+from advtex_server.events import Lookout
 from advtex_server.intake import Intake
 from advtex_server.metrics import Metrics, MetricsMiddleware
 from advtex_server.refusal import ANYWHERE
@@ -64,6 +65,7 @@ def create_app(settings: ServerSettings) -> FastAPI:
     app.state.stopping = asyncio.Event()
     app.state.intake = Intake(store, settings)
     app.state.bodies = OpenBodies()
+    app.state.lookout = Lookout(app.state.service)
     errors.install(app)
     doorkeeper = Doorkeeper(store.accounts, settings.auth_failures_per_minute)
     app.add_middleware(AccessMiddleware, doorkeeper=doorkeeper, max_body_bytes=settings.max_body_bytes)

@@ -16,20 +16,58 @@ from advtex_store.errors import RecordNotFound
 from advtex_store.models import EventRow, JobRow
 
 POLL_SECONDS = 0.5
+FRESH_SECONDS = 0.3  # streams of one job share what was read so long ago at most
 PING_SECONDS = 15.0
 
 
+class _Look:
+    """A job as it was read once: its row, the `job` message about it, and its events after some versions."""
+
+    def __init__(self, service: Service, owner: str, job_id: str) -> None:
+        self._records, self._owner, self._job_id = service.store.records, owner, job_id
+        self._events: dict[int, asyncio.Future[list[EventRow]]] = {}
+        self.at = time.monotonic()
+        self.job = asyncio.ensure_future(run_in_threadpool(self._read))
+
+    def _read(self) -> tuple[JobRow, str]:
+        row = self._records.job(self._job_id, self._owner)
+        return row, _message("job", row.version, job_view(row).model_dump_json())
+
+    def events(self, after: int) -> asyncio.Future[list[EventRow]]:
+        """Recorded after this version."""
+        if after not in self._events:
+            read = run_in_threadpool(self._records.events, self._job_id, after)
+            self._events[after] = asyncio.ensure_future(read)
+        return self._events[after]
+
+
+class Lookout:
+    """The newest look at each job that streams follow: however many they are, the database is asked once."""
+
+    def __init__(self, service: Service) -> None:
+        self._service = service
+        self._looks: dict[tuple[str, str], _Look] = {}
+
+    def look(self, owner: str, job_id: str) -> _Look:
+        """A fresh look, which others may share: shield its futures from the end of one stream."""
+        oldest = time.monotonic() - FRESH_SECONDS
+        self._looks = {key: look for key, look in self._looks.items() if look.at > oldest}
+        if (owner, job_id) not in self._looks:
+            self._looks[owner, job_id] = _Look(self._service, owner, job_id)
+        return self._looks[owner, job_id]
+
+
 async def stream_events(
-    service: Service, owner: str, job_id: str, after: int, stopping: asyncio.Event
+    lookout: Lookout, owner: str, job_id: str, after: int, stopping: asyncio.Event
 ) -> AsyncIterator[str]:
     """Changes after version `after`, then new ones until the job has ended, was deleted, or the server stops."""
-    records = service.store.records
     seen, spoken = after, time.monotonic()
     first = True
     while not stopping.is_set():
+        look = lookout.look(owner, job_id)
         try:
-            row = await run_in_threadpool(records.job, job_id, owner)
-            recorded = await run_in_threadpool(records.events, job_id, seen) if row.version > seen else []
+            row, message = await asyncio.shield(look.job)
+            recorded = await asyncio.shield(look.events(seen)) if row.version > seen else []
         except RecordNotFound:
             return
         except DBAPIError:
@@ -37,7 +75,7 @@ async def stream_events(
             continue
         if first or row.version > seen:
             yield "".join(_message(e.data["kind"], e.version, json.dumps(e.data)) for e in _until(recorded, row))
-            yield _message("job", row.version, job_view(row).model_dump_json())
+            yield message
             seen, spoken, first = max(seen, row.version), time.monotonic(), False
         if JobState(row.state) in TERMINAL:
             return

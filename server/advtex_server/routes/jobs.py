@@ -136,8 +136,9 @@ def job_events(
     whole job as `GET /v1/jobs/{job_id}` shows it, whenever it has changed. Ids grow.
     """
     service.job(caller.owner, job_id)
+    state = request.app.state
     after = int(last_event_id) if last_event_id.isascii() and last_event_id.isdigit() else 0
-    events = stream_events(service, caller.owner, job_id, min(after, 2**62), request.app.state.stopping)
+    events = stream_events(state.lookout, caller.owner, job_id, min(after, 2**62), state.stopping)
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     return StreamingResponse(events, media_type="text/event-stream", headers=headers)
 

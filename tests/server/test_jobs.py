@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import json
 import threading
@@ -12,7 +13,8 @@ from typing import Any
 import pytest
 
 from advtex_contract.jobs import JobError, JobPage, JobView, Progress
-from advtex_store.errors import StaleAttempt
+from advtex_server.events import FRESH_SECONDS, Lookout
+from advtex_store.errors import RecordNotFound, StaleAttempt
 from advtex_store.needs import needed_memory
 
 
@@ -337,3 +339,34 @@ def test_many_callers_at_once(live: Any, scan_zip: Path) -> None:
         thread.join()
     assert sorted(answers) == [200] * 24 + [201] * 24
     assert len(live.http.get("/v1/jobs").json()["jobs"]) == 24
+
+
+def test_streams_of_one_job_share_a_look(live: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    job_id = live.job(live.upload())["id"]
+    reads: list[str] = []
+    read = live.store.records.job
+
+    def counted(job_id: str, owner: str) -> Any:
+        reads.append(owner)
+        return read(job_id, owner)
+
+    monkeypatch.setattr(live.store.records, "job", counted)
+
+    async def looks() -> None:
+        lookout = Lookout(live.app.state.service)
+        first = lookout.look("me", job_id)
+        assert lookout.look("me", job_id) is first
+        assert lookout.look("you", job_id) is not first
+        row, message = await first.job
+        assert row.id == job_id
+        assert f'"id":"{job_id}"' in message
+        assert first.events(0) is first.events(0)
+        assert [event.version for event in await first.events(0)] == [row.version]
+        with pytest.raises(RecordNotFound):
+            await lookout.look("you", job_id).job
+        first.at -= FRESH_SECONDS
+        assert lookout.look("me", job_id) is not first
+        await lookout.look("me", job_id).job
+
+    asyncio.run(looks())
+    assert sorted(reads) == ["me", "me", "you"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -20,6 +21,10 @@ import redis
 
 from advtex_store.blobs import Blobs, open_blobs
 from advtex_store.database import upgrade_database
+
+# A shell's background command is started with Ctrl-C ignored, and its children inherit that; some tests send it.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def load(path: Path) -> ModuleType:

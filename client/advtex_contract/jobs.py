@@ -14,6 +14,7 @@ from advtex_contract.options import JobOptions
 Label = Annotated[str, StringConstraints(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
 
 
+ID_PATTERN = r"^[0-9A-Za-z_-]{1,64}$"
 BatchId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")]
 
 
@@ -39,7 +40,7 @@ class JobSpec(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    upload_id: str | None = None
+    upload_id: str | None = Field(default=None, pattern=r"^[0-9A-Za-z_-]{0,64}$")
     source: str | None = Field(
         default=None, max_length=2000, description="file:// or s3:// URL below a root that the operator allowed"
     )
@@ -59,8 +60,13 @@ class JobSpec(BaseModel):
 
 
 class Progress(BaseModel):
-    """Where a running job stands. `losses` holds the newest values by name; times are seconds; `steps_per_second` is
-    this attempt's rate in this stage."""
+    """Where a running job stands.
+
+    losses: the newest values by name. stage_seconds: of all attempts. stage_peak_bytes, stage_device_peak_bytes: the
+    most memory that the engine's process, and its tensors on a GPU, took in a stage that has ended, in the last attempt
+    that ran it. steps_per_second: this attempt's rate in this stage. notes: what the engine has to say that is no
+    warning, in words.
+    """
 
     model_config = ConfigDict(extra="forbid")
 
@@ -69,8 +75,11 @@ class Progress(BaseModel):
     steps: int = 0
     losses: dict[str, float] = Field(default_factory=dict)
     stage_seconds: dict[str, float] = Field(default_factory=dict)
+    stage_peak_bytes: dict[str, int] = Field(default_factory=dict)
+    stage_device_peak_bytes: dict[str, int] = Field(default_factory=dict)
     steps_per_second: float | None = None
     eta_seconds: float | None = None
+    notes: list[str] = Field(default_factory=list)
 
 
 class ResultFile(BaseModel):

@@ -27,6 +27,15 @@ PRESET_HELP: dict[Preset, str] = {
 }
 
 
+PRESET_COST: dict[Preset, str] = {
+    Preset.auto: "as full on a GPU, as standard on a CPU",
+    Preset.paper: "about 2 hours for views of 320x240 on 2 CPU cores, 8 hours for 640x480; much less on a GPU",
+    Preset.full: "about 2 hours for views of 320x240 on 2 CPU cores, 8 hours for 640x480; much less on a GPU",
+    Preset.standard: "about 7 minutes for views of 320x240 on 2 CPU cores, 13 minutes for 640x480",
+    Preset.preview: "about 2 minutes for views of 320x240 on 2 CPU cores, 8 minutes for 640x480",
+}
+
+
 class Method(StrEnum):
     """How the texture is made. All but `adversarial` are there to compare with it."""
 
@@ -67,11 +76,15 @@ class JobOptions(BaseModel):
     height: int | None = Field(default=None, ge=64, le=4096, description="working height of the views, pixels")
     steps: int | None = Field(default=None, ge=1, le=1_000_000, description="overrides the preset's step count")
     face_budget: int | None = Field(default=None, ge=100, le=2_000_000, description="decimate the mesh to this")
+    max_views: int | None = Field(default=None, ge=2, le=2000, description="choose these many frames of a longer scan")
     max_texture_size: int = Field(default=4096, ge=256, le=16384, description="cap on the texture's side, texels")
     holdout: int | None = Field(
         default=None, ge=2, le=1000, description="leave out every Nth sorted frame (position % N == N // 2)"
     )
     seed: int = Field(default=0, ge=0, le=2**31 - 1)
+    layout: str | None = Field(
+        default=None, max_length=40, description="read the files as this layout; otherwise as the one that fits best"
+    )
 
     @model_validator(mode="after")
     def _size_is_whole(self) -> Self:

@@ -25,14 +25,17 @@ from advtex_scan.images import ImageHeader, read_image_header
 from advtex_scan.manifest import (
     IDENTITY,
     ByteRange,
+    Distortion,
     FileRef,
     FrameEntry,
     Intrinsics,
     Matrix4,
     MeshEntry,
+    MeshRefinement,
     ScanKind,
     ScanManifest,
     UpAxis,
+    VideoFrame,
 )
 from advtex_scan.mesh import MeshFacts
 
@@ -42,6 +45,7 @@ __all__ = [
     "ArchiveLimits",
     "ByteRange",
     "CheckReport",
+    "Distortion",
     "FileRef",
     "Finding",
     "FrameEntry",
@@ -53,6 +57,7 @@ __all__ = [
     "MeshEntry",
     "MeshError",
     "MeshFacts",
+    "MeshRefinement",
     "ScanArchive",
     "ScanFormatError",
     "ScanKind",
@@ -60,6 +65,7 @@ __all__ = [
     "ScanReading",
     "UnsafeArchiveError",
     "UpAxis",
+    "VideoFrame",
     "check_scan",
     "open_scan",
     "read_image_header",

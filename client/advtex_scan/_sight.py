@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
+from dataclasses import replace
 from itertools import accumulate
 
 from advtex_scan.errors import Findings
-from advtex_scan.manifest import FrameEntry, ScanManifest
-from advtex_scan.matrices import invert_rigid
+from advtex_scan.manifest import IDENTITY, FrameEntry, ScanManifest
+from advtex_scan.matrices import compose, invert_rigid
 from advtex_scan.mesh import MeshSurface
 from advtex_scan.mesh._surface import Vector
 
@@ -25,9 +26,10 @@ def check_sight(findings: Findings, manifest: ScanManifest, mesh: MeshSurface) -
     """Report cameras far from the mesh, and that none of them, or few, see it."""
     if not manifest.frames:
         return
+    frames = _in_mesh_coordinates(manifest)
     low, high = mesh.facts.bounds
     diagonal = math.dist(low, high)
-    distances = [_distance_to_box(_center(frame), low, high) for frame in manifest.frames]
+    distances = [_distance_to_box(_center(frame), low, high) for frame in frames]
     remedy = "bring both into one coordinate system and into metres, and check that poses are camera-to-world"
     if min(distances) > FAR_FACTOR * diagonal:
         message = f"the nearest camera is {min(distances):.2f} m away from a mesh of {diagonal:.2f} m"
@@ -35,8 +37,8 @@ def check_sight(findings: Findings, manifest: ScanManifest, mesh: MeshSurface) -
     if diagonal > LARGE_MESH:
         message = f"measures {diagonal:.0f} m across"
         findings.warning("mesh_large", mesh.facts.path, message, "check that it is in metres, not in millimetres")
-    step = -(-len(manifest.frames) // SAMPLED_FRAMES)
-    tried = manifest.frames[::step]
+    step = -(-len(frames) // SAMPLED_FRAMES)
+    tried = frames[::step]
     points = spread_points(mesh, SAMPLED_POINTS)
     blind = [frame.name for frame in tried if not sees(frame, points)]
     if len(blind) == len(tried):
@@ -46,6 +48,14 @@ def check_sight(findings: Findings, manifest: ScanManifest, mesh: MeshSurface) -
         for name in blind:
             message = "does not see the mesh"
             findings.warning("frame_blind", name, message, "check its pose, or that the mesh is complete")
+
+
+def _in_mesh_coordinates(manifest: ScanManifest) -> tuple[FrameEntry, ...]:
+    """The frames as seen from the mesh's own coordinates."""
+    if manifest.mesh is None or manifest.mesh.mesh_to_world == IDENTITY:
+        return manifest.frames
+    to_mesh = invert_rigid(manifest.mesh.mesh_to_world)
+    return tuple(replace(frame, camera_to_world=compose(to_mesh, frame.camera_to_world)) for frame in manifest.frames)
 
 
 def spread_points(mesh: MeshSurface, count: int) -> list[Vector]:

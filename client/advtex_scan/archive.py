@@ -1,4 +1,4 @@
-"""A scan's files, from a folder or a zip, read as streams; nothing is ever unpacked to disk.
+"""A scan's files, from a folder, a zip or a lone `.sens`, read as streams; nothing is ever unpacked to disk.
 
     with open_scan("scan.zip") as archive:
         archive.names()                       # "color/0.jpg", ...: sorted, below the one top folder if there is one
@@ -13,6 +13,7 @@ from __future__ import annotations
 import io
 import os
 import stat
+import zlib
 from abc import ABC, abstractmethod
 from pathlib import Path
 from types import TracebackType
@@ -26,6 +27,8 @@ from advtex_scan.errors import ArchiveError, Finding, Findings, LimitError
 from advtex_scan.manifest import ByteRange, FileRef
 
 READ_LIMIT = 256 << 20  # bytes that `read` returns at most unless told otherwise
+STREAM_MAGIC = b"\x04\0\0\0"  # ScanNet's `.sens`, version 4: told by its content, for servers rename what they store
+STREAM_NAME = "scan.sens"
 
 
 class ScanArchive(ABC):
@@ -56,7 +59,8 @@ class ScanArchive(ABC):
     def stamps(self) -> list[tuple[str, int, int]]:
         """Name, size and stamp of all files, sorted; a file that is changed later has another size or stamp.
 
-        A stamp is the checksum of a zip's member, and the time of a plain file's last change in nanoseconds.
+        A stamp is the checksum of a zip's member or of a lone file, and the time of the last change, in nanoseconds, of
+        a file in a folder.
         """
         return [(name, size, self._stamp(self._prefix + name)) for name, size in self._sizes.items()]
 
@@ -125,13 +129,15 @@ class ScanArchive(ABC):
 
 
 def open_scan(path: str | os.PathLike[str], limits: ArchiveLimits | None = None) -> ScanArchive:
-    """Open a folder or a zip. Raises ArchiveError with every reason why it is refused."""
+    """Open a folder, a zip or a `.sens` file. Raises ArchiveError with every reason why it is refused."""
     location = Path(path)
     limits = limits or ArchiveLimits()
     if location.is_dir():
         return _FolderArchive(location, limits)
     if location.is_file():
-        return _ZipArchive(location, limits)
+        with location.open("rb") as file:
+            is_stream = file.read(len(STREAM_MAGIC)) == STREAM_MAGIC
+        return _StreamArchive(location, limits) if is_stream else _ZipArchive(location, limits)
     raise ArchiveError(
         Finding("error", "not_found", location.name, "is neither a folder nor a file", "give the path of a scan")
     )
@@ -160,6 +166,38 @@ class _ZipArchive(ScanArchive):
 
     def _range(self, name: str, offset: int, length: int) -> bytes:
         return self._reader.read(self._extents[name], offset, length)
+
+
+class _StreamArchive(ScanArchive):
+    """A scan that is one file, under STREAM_NAME."""
+
+    def __init__(self, path: Path, limits: ArchiveLimits) -> None:
+        self._source = FileSource(path)
+        if self._source.size > limits.member_bytes:
+            self.close()
+            message = f"is larger than {limits.member_bytes} bytes"
+            raise ArchiveError(Finding("error", "member_too_large", path.name, message, "split the scan"))
+        super().__init__(path, {STREAM_NAME: self._source.size})
+
+    def close(self) -> None:
+        self._source.close()
+
+    def _stamp(self, name: str) -> int:
+        checksum = 0
+        with self.open(name) as stream:
+            while data := stream.read(1 << 20):
+                checksum = zlib.crc32(data, checksum)
+        return checksum
+
+    def _stream(self, name: str) -> io.RawIOBase:
+        assert name == STREAM_NAME
+        return io.FileIO(self.path, "rb")
+
+    def _range(self, name: str, offset: int, length: int) -> bytes:
+        data = self._source.read(length, offset)
+        if len(data) != length:
+            raise _changed(name)
+        return data
 
 
 class _FolderArchive(ScanArchive):

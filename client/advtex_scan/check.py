@@ -16,11 +16,19 @@ from advtex_scan._frames import check_frame
 from advtex_scan._sight import check_sight
 from advtex_scan.archive import ScanArchive, open_scan
 from advtex_scan.errors import Finding, ScanFormatError
-from advtex_scan.layouts import LAYOUTS, ScanReader, detect_layout
+from advtex_scan.images import EXR_REMEDY
+from advtex_scan.layouts import LAYOUT_NAMES, Layout, Match, ScanReader, matching_layouts
+from advtex_scan.layouts._mesh_choice import MESH_SUFFIXES
+from advtex_scan.layouts._reader import IMAGE_SUFFIXES
 from advtex_scan.manifest import ScanManifest
 from advtex_scan.mesh import MeshFacts, read_mesh
 
 MIN_FRAMES = 3
+KINDS = {
+    "images": IMAGE_SUFFIXES,
+    "videos": (".mp4", ".mov"),
+    "meshes or point clouds": MESH_SUFFIXES,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +36,7 @@ class CheckReport:
     """What was found in a scan.
 
     layout, why: the layout's name and what gave it away; empty if none was recognized
+    sureness: of the layout, 0 to 1
     frames_found, frames_usable: in the files, and left after dropped and broken ones
     dropped: frames left out, by reason
     view_size: width and height of the largest color image, pixels
@@ -35,6 +44,7 @@ class CheckReport:
 
     layout: str = ""
     why: str = ""
+    sureness: float = 0.0
     frames_found: int = 0
     frames_usable: int = 0
     dropped: Mapping[str, int] = field(default_factory=dict)
@@ -53,6 +63,7 @@ class CheckReport:
             "ok": self.ok,
             "layout": self.layout,
             "why": self.why,
+            "sureness": self.sureness,
             "frames_found": self.frames_found,
             "frames_usable": self.frames_usable,
             "dropped": dict(self.dropped),
@@ -63,9 +74,10 @@ class CheckReport:
 
     def format_text(self) -> str:
         """The report for people, without a final line break."""
-        lines = [f"layout   {self.layout} ({self.why})" if self.layout else "layout   not recognized"]
+        found = f"{self.layout}, {self.sureness:.0%} sure: {self.why}" if self.layout else "not recognized"
+        lines = [f"layout   {found}"]
         lines.append(f"frames   {self.frames_usable} usable of {self.frames_found}{_left_out(self.dropped)}")
-        lines.append(f"mesh     {self.mesh.describe()}" if self.mesh else "mesh     none")
+        lines.append(f"mesh     {self.mesh.describe() if self.mesh else 'none'}")
         for finding in self.findings:
             place = f"{finding.where}: " if finding.where else ""
             lines.append(f"{finding.severity:<8} {place}{finding.message}")
@@ -87,13 +99,16 @@ class ScanReading:
     report: CheckReport
 
 
-def check_scan(scan: str | os.PathLike[str] | ScanArchive) -> CheckReport:
-    """Report on a folder, a zip or an open archive. Never raises for what is wrong with the scan."""
+def check_scan(scan: str | os.PathLike[str] | ScanArchive, layout: str | None = None) -> CheckReport:
+    """Report on a folder, a zip or an open archive. Never raises for what is wrong with the scan.
+
+    layout: one of LAYOUT_NAMES to read the files as; None takes the surest.
+    """
     if isinstance(scan, ScanArchive):
-        return read_scan(scan).report
+        return read_scan(scan, layout).report
     try:
         with open_scan(scan) as archive:
-            return read_scan(archive).report
+            return read_scan(archive, layout).report
     except ScanFormatError as error:
         return CheckReport(findings=error.findings)
     except OSError as error:
@@ -101,29 +116,30 @@ def check_scan(scan: str | os.PathLike[str] | ScanArchive) -> CheckReport:
         return CheckReport(findings=(Finding("error", "unreadable_file", Path(scan).name, message, "check it"),))
 
 
-def read_scan(archive: ScanArchive) -> ScanReading:
+def read_scan(archive: ScanArchive, layout: str | None = None) -> ScanReading:
     """Read an archive's manifest and check all that can be checked without decoding images.
 
-    Nothing that is wrong with the scan raises; it is in the report.
+    layout: as for `check_scan`. Nothing that is wrong with the scan raises; it is in the report.
     """
-    detected = detect_layout(archive)
-    if detected is None:
-        names = ", ".join(layout.NAME for layout in LAYOUTS)
-        remedy = f"write a scan.json, or use one of the layouts {names}"
-        message = "the files are of no known layout" if archive.names() else "there are no files"
-        finding = Finding("error", "unknown_layout", "", message, remedy)
-        return ScanReading(None, CheckReport(findings=(finding,)))
-    layout, match = detected
+    matches = matching_layouts(archive)
+    chosen = next((pair for pair in matches if layout in (None, pair[0].NAME)), None)
+    if chosen is None:
+        return ScanReading(None, CheckReport(findings=(_no_layout(archive, layout, matches),)))
     reader = ScanReader(archive)
-    manifest = layout.read(reader)
+    manifest = chosen[0].read(reader)
     facts = None
     if manifest is not None:
         manifest = _usable(reader, manifest)
         facts = _check_mesh(reader, manifest)
         _report_ignored(reader)
+    for other, match in matches:
+        if other is not chosen[0]:
+            message = f"the files could also be read as {other.NAME} ({match.score:.0%} sure: {match.why})"
+            reader.findings.info("other_layout", "", message, f"--layout {other.NAME} reads them so")
     report = CheckReport(
-        layout=layout.NAME,
-        why=match.why,
+        layout=chosen[0].NAME,
+        why=chosen[1].why,
+        sureness=chosen[1].score,
         frames_found=reader.frames_found,
         frames_usable=len(manifest.frames) if manifest else 0,
         dropped=dict(reader.dropped),
@@ -132,6 +148,33 @@ def read_scan(archive: ScanArchive) -> ScanReading:
         findings=reader.findings.result(),
     )
     return ScanReading(manifest, report)
+
+
+def _no_layout(archive: ScanArchive, layout: str | None, matches: list[tuple[Layout, Match]]) -> Finding:
+    names = ", ".join(LAYOUT_NAMES)
+    if layout is not None and layout not in LAYOUT_NAMES:
+        message = f"{layout[:40]!r} is no layout that this program knows"
+        return Finding("error", "unknown_layout", "", message, f"choose one of {names}")
+    if layout is not None:
+        found = f"; they look like {matches[0][0].NAME}: {matches[0][1].why}" if matches else ""
+        remedy = "leave the layout out, or give a scan of it"
+        return Finding("error", "unknown_layout", "", f"the files are not laid out as {layout}{found}", remedy)
+    streams = [name for name in archive.names() if name.lower().endswith(".r3d")]
+    if streams:
+        return Finding("error", "unknown_layout", streams[0], "is a scan by itself", "give this file, not its folder")
+    if not archive.names():
+        return Finding("error", "unknown_layout", "", "there are no files", "give the folder or zip of a scan")
+    pictures = [name for name in archive.names() if name.lower().endswith(".exr")]
+    if pictures:
+        message = "is an OpenEXR image, and the files are no scan of a known layout"
+        return Finding("error", "exr_image", pictures[0], message, EXR_REMEDY)
+    kinds = {kind: sum(name.lower().endswith(ends) for name in archive.names()) for kind, ends in KINDS.items()}
+    held = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count) or "nothing that could be one"
+    remedy = (
+        "give the whole export with its camera poses (of Polycam the raw data, of 3D Scanner App all data, of Record3D "
+        f"the .r3d), or write a scan.json; known layouts are {names}"
+    )
+    return Finding("error", "unknown_layout", "", f"the files are no scan of a known layout; they hold {held}", remedy)
 
 
 def _largest(manifest: ScanManifest | None) -> tuple[int, int]:
@@ -164,12 +207,7 @@ def _left_out(dropped: Mapping[str, int]) -> str:
 
 def _check_mesh(reader: ScanReader, manifest: ScanManifest) -> MeshFacts | None:
     if manifest.mesh is None:
-        if not reader.mesh_reported:
-            remedy = (
-                "add the scan's reconstruction as mesh.ply, .obj or .glb, in the coordinates of the poses; "
-                'scan.json names it as "mesh"'
-            )
-            reader.findings.error("no_mesh", "", "there is no mesh", remedy)
+        _report_no_mesh(reader, manifest)
         return None
     reader.used.add(manifest.mesh.path)
     try:
@@ -180,6 +218,19 @@ def _check_mesh(reader: ScanReader, manifest: ScanManifest) -> MeshFacts | None:
     reader.used.update(mesh.files)
     check_sight(reader.findings, manifest, mesh)
     return mesh.facts
+
+
+def _report_no_mesh(reader: ScanReader, manifest: ScanManifest) -> None:
+    if reader.mesh_reported:
+        return
+    if any(frame.depth is not None for frame in manifest.frames):
+        reader.findings.info("mesh_fused", "", "there is no mesh; it will be fused from the depth images")
+        return
+    remedy = (
+        "add the scan's reconstruction as mesh.ply, .obj or .glb, in the coordinates of the poses (scan.json names it "
+        'as "mesh"), or depth images, which it is fused from'
+    )
+    reader.findings.error("no_mesh", "", "there is neither a mesh nor depth", remedy)
 
 
 def _report_ignored(reader: ScanReader) -> None:

@@ -9,13 +9,19 @@ from typing import Literal
 
 from advtex_scan.archive import ScanArchive
 from advtex_scan.errors import Finding, ImageError
-from advtex_scan.manifest import FileRef
+from advtex_scan.manifest import FileRef, VideoFrame
 
 MAX_PIXELS = 64_000_000  # a 48-megapixel phone picture passes, a decompression bomb does not
 FIRST_BYTES = 4 << 10
 LAST_BYTES = 1 << 10  # an end marker is the last thing in most files
 MOST_BYTES = 1 << 20  # a JPEG's profile and thumbnail may stand before its size
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+EXR_SIGNATURE = b"\x76\x2f\x31\x01"
+# Both apps that may write it can write something else: a reader of all its compressions would be for nothing but that.
+EXR_REMEDY = (
+    "OpenEXR is not read: write depth as 16-bit PNG; of Record3D export the .r3d (Shareable/Internal format), "
+    "of 3D Scanner App a capture in low resolution with depth"
+)
 PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 PNG_DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
 JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # start-of-frame markers
@@ -32,9 +38,13 @@ class ImageHeader:
     channels: int
 
 
-def place(ref: FileRef) -> str:
-    """The file of a reference, with the byte position for a member of a stream."""
-    return ref if isinstance(ref, str) else f"{ref.path} (byte {ref.offset})"
+def place(ref: FileRef | VideoFrame) -> str:
+    """The file of a reference, with the position for a member of a stream or video."""
+    if isinstance(ref, str):
+        return ref
+    if isinstance(ref, VideoFrame):
+        return f"{ref.path} (frame {ref.index})"
+    return f"{ref.path} (byte {ref.offset})" if ref.offset else ref.path
 
 
 def read_image_header(archive: ScanArchive, ref: FileRef) -> ImageHeader:
@@ -76,6 +86,8 @@ def parse_image_header(data: bytes, where: str) -> ImageHeader | None:
         return _png(data, where)
     if data.startswith(b"\xff\xd8"):
         return _jpeg(data, where)
+    if data.startswith(EXR_SIGNATURE):
+        raise ImageError(Finding("error", "exr_image", where, "is an OpenEXR image", EXR_REMEDY))
     raise _no_image(where, "is empty" if not data else "is neither PNG nor JPEG")
 
 

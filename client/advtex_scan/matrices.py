@@ -41,6 +41,31 @@ def invert_rigid(transform: Matrix4) -> Matrix4:
     return matrix4(values)
 
 
+def opencv_axes(pose: Matrix4) -> Matrix4:
+    """A camera_to_world whose camera axes are OpenGL's and ARKit's (y up, z backward), with OpenCV's; same world."""
+    return matrix4([sign * value for row in pose for sign, value in zip((1, -1, -1, 1), row, strict=True)])
+
+
+def from_quaternion(x: float, y: float, z: float, w: float, shift: Sequence[float]) -> Matrix4:
+    """The rotation of a unit quaternion, then `shift`; a quaternion of another length gives no rotation."""
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), shift[0]),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), shift[1]),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), shift[2]),
+    )
+    return matrix4([value for row in rows for value in row])
+
+
+def from_rotation_vector(vector: Sequence[float], shift: Sequence[float]) -> Matrix4:
+    """The rotation by |vector| radians about `vector`, then `shift`; NaN for a vector without a length."""
+    angle = math.hypot(*vector)
+    if not math.isfinite(angle):
+        return matrix4([math.nan] * 12)
+    scale = math.sin(angle / 2) / angle if angle else 0.5
+    x, y, z = (scale * value for value in vector)
+    return from_quaternion(x, y, z, math.cos(angle / 2), shift)
+
+
 def pose_problem(transform: Matrix4) -> str | None:
     """Why a matrix is no rigid transform, None if it is one within ROTATION_TOLERANCE."""
     if not all(math.isfinite(value) for row in transform for value in row):

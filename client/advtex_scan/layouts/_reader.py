@@ -13,6 +13,7 @@ from advtex_scan.errors import Findings, ScanFormatError
 from advtex_scan.images import read_image_header
 from advtex_scan.manifest import FileRef, Intrinsics, Matrix4, ScanManifest
 from advtex_scan.matrices import is_lost, matrix4, pose_problem
+from advtex_scan.video import VideoHeader, read_video_header
 
 TEXT_LIMIT = 1 << 20  # bytes of a pose, intrinsics or info file
 OPENCV_OFFSET = 0.5  # added to the principal point where files count the first pixel's centre as (0, 0)
@@ -52,12 +53,13 @@ class ScanReader:
         self.frames_found = 0
         self.dropped: Counter[str] = Counter()
         self.mesh_reported = False  # a finding says why there is no mesh
+        self._videos: dict[str, VideoHeader | None] = {}
 
-    def text(self, name: str) -> str | None:
-        """A small text file; None, with a finding, if it cannot be read."""
+    def text(self, name: str, limit: int = TEXT_LIMIT) -> str | None:
+        """A text file of at most `limit` bytes; None, with a finding, if it cannot be read."""
         self.used.add(name)
         try:
-            return self.archive.read(name, TEXT_LIMIT).decode("utf-8", "replace")
+            return self.archive.read(name, limit).decode("utf-8", "replace")
         except ScanFormatError as error:
             self.findings.extend(error.findings)
             return None
@@ -110,6 +112,17 @@ class ScanReader:
         """Leave a frame out, counted by reason, with a warning."""
         self.dropped[reason] += 1
         self.findings.warning(reason, where, message, remedy)
+
+    def video(self, name: str) -> VideoHeader | None:
+        """What a video says of its pictures; None, with one finding for all of its frames, if it cannot be read."""
+        if name not in self._videos:
+            self.used.add(name)
+            try:
+                self._videos[name] = read_video_header(self.archive, name)
+            except ScanFormatError as error:
+                self.findings.extend(error.findings)
+                self._videos[name] = None
+        return self._videos[name]
 
     def image_size(self, refs: list[FileRef]) -> tuple[int, int] | None:
         """Width and height that most of a few images have; None if no image has a sound header.

@@ -26,6 +26,7 @@ from advtex_scan.errors import ScanFormatError
 from advtex_scan.images import read_image_header
 from advtex_scan.layouts._mesh_choice import choose_mesh
 from advtex_scan.layouts._reader import IMAGE_SUFFIXES, Match, ScanReader, parse_numbers, parse_settings, parse_size
+from advtex_scan.layouts._sequences import padded
 from advtex_scan.manifest import FrameEntry, Intrinsics, Matrix4, ScanManifest
 from advtex_scan.matrices import invert_rigid, up_axis_of
 
@@ -83,12 +84,7 @@ def _frame(
     camera = cameras["color"] if "color" in cameras else _own_intrinsics(reader, lines, cam, color)
     if pose is None or camera is None:
         return None
-    return FrameEntry(sortable(stem), color, depth, pose, camera, cameras.get("depth"))
-
-
-def sortable(stem: str) -> str:
-    """The name with each number in at least six digits, so that names sort as their numbers do."""
-    return re.sub(r"\d+", lambda match: match[0].zfill(6), stem)
+    return FrameEntry(padded(stem), color, depth, pose, camera, cameras.get("depth"))
 
 
 def _pose(reader: ScanReader, lines: list[str], cam: str) -> Matrix4 | None:

@@ -1,4 +1,4 @@
-"""`advtex-engine texture|evaluate|synthesize|compare|bench`: the engine alone, without a service."""
+"""`advtex-engine texture|check|evaluate|synthesize|compare|bench`: the engine alone, without a service."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
+from advtex_engine.bench_options import add_bench_options
 from advtex_engine.config import METHODS, PRESETS, TextureConfig
 from advtex_engine.errors import EngineError, OptionError, Problem, Stopped
 from advtex_engine.monitor import Monitor
+from advtex_scan.layouts import LAYOUT_NAMES
 
 
 class _Printer(Monitor):
@@ -24,6 +26,9 @@ class _Printer(Monitor):
 
     def warning(self, problem: Problem) -> None:
         self._say(f"warning: {problem.where}: {problem.message} ({problem.remedy})")
+
+    def note(self, message: str) -> None:
+        self._say(message)
 
     def _say(self, words: str) -> None:
         print(f"[{time.monotonic() - self.started:7.1f} s] {words}", file=sys.stderr, flush=True)
@@ -46,7 +51,9 @@ class _Terminal(_Printer):
     def stage_started(self, stage: str) -> None:
         self._say(f"{stage} ...")
 
-    def stage_finished(self, stage: str, seconds: float, peak_memory_bytes: int) -> None:
+    def stage_finished(
+        self, stage: str, seconds: float, peak_memory_bytes: int, _peak_device_memory_bytes: int | None
+    ) -> None:
         self._say(f"{stage}: {seconds:.1f} s, peak memory {peak_memory_bytes / 2**20:.0f} MiB")
 
     def progress(self, step: int, steps: int, losses: Mapping[str, float]) -> None:
@@ -87,16 +94,23 @@ def _parser() -> argparse.ArgumentParser:
         help="refine cameras and exposures first; the preset paper never does, the method colormap always",
     )
     texture.add_argument("--face-budget", type=int, default=TextureConfig.face_budget)
+    texture.add_argument("--max-views", type=int, default=TextureConfig.max_views, help="chosen from a longer scan")
     texture.add_argument("--max-texture-size", type=int, default=TextureConfig.max_texture_size)
+    texture.add_argument("--layout", choices=LAYOUT_NAMES, help="how the files are laid out; else found out")
     texture.add_argument("--device", default="auto")
     texture.add_argument("--seed", type=int, default=0)
     texture.add_argument("--checkpoint-seconds", type=float, default=TextureConfig.checkpoint_seconds)
     texture.add_argument("--resume", action="store_true", help="go on from the checkpoint in OUT/work")
+    check = commands.add_parser("check", help="measure whether a scan means what its layout says")
+    check.add_argument("scan", type=Path, help="folder or zip")
+    check.add_argument("--layout", choices=LAYOUT_NAMES, help="how the files are laid out; else found out")
+    check.add_argument("--json", action="store_true", help="one line of JSON")
     evaluate = commands.add_parser("evaluate", help="score a textured model against a scan's photographs")
     evaluate.add_argument("model", type=Path, help="OBJ or GLB with one texture")
     evaluate.add_argument("scan", type=Path, help="folder or zip")
     evaluate.add_argument("--holdout", type=int, help="only the sorted frames whose position %% N == N // 2")
     evaluate.add_argument("--size", type=parse_size, help="size of renders and photographs, WIDTHxHEIGHT")
+    evaluate.add_argument("--layout", choices=LAYOUT_NAMES, help="how the scan's files are laid out; else found out")
     evaluate.add_argument("--reference", type=Path, help="mesh that decides which pixels count; default: the scan's")
     evaluate.add_argument("--lpips-weights", type=Path, help="folder; default: $ADVTEX_LPIPS_WEIGHTS, else the cache")
     evaluate.add_argument("--download-weights", action="store_true", help="fetch the weights of LPIPS if they lack")
@@ -113,12 +127,8 @@ def _parser() -> argparse.ArgumentParser:
     compare = commands.add_parser("compare", help="score a result against the truth of a synthesized scan")
     compare.add_argument("model", type=Path, help="model.obj")
     compare.add_argument("scan", type=Path, help="the synthesized scan")
-    bench = commands.add_parser("bench", help="time one optimization step, on a crop of a view, and its parts")
-    bench.add_argument("--device", default="auto")
-    bench.add_argument("--width", type=int, default=640, help="of the full frame in pixels; a step sees a crop of it")
-    bench.add_argument("--height", type=int, default=480, help="of the full frame in pixels")
-    bench.add_argument("--preset", default="paper", choices=PRESETS, help="decides the crop's size and the losses")
-    bench.add_argument("--json", action="store_true", help="one line of JSON")
+    bench = commands.add_parser("bench", help="time a step of the optimization, its parts and the stages around it")
+    add_bench_options(bench)
     return parser
 
 
@@ -150,13 +160,24 @@ def _texture(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _check(arguments: argparse.Namespace) -> int:
+    from advtex_engine.deep_check import deep_check
+
+    check = deep_check(arguments.scan, arguments.layout)
+    if arguments.json:
+        print(json.dumps(None if check is None else check.to_dict()))
+    else:
+        print("nothing can be measured: there is neither depth nor a mesh" if check is None else check.format_text())
+    return 1 if check is not None and check.hopeless else 0
+
+
 def _evaluate(arguments: argparse.Namespace) -> int:
     from advtex_engine.evaluate import evaluate, write_json
     from advtex_engine.perceptual import LPIPS_SOURCES, download, weights_folder
 
     if arguments.download_weights:
         download(LPIPS_SOURCES, weights_folder(arguments.lpips_weights))
-    given = {name: getattr(arguments, name) for name in ("model", "scan", "size", "holdout", "reference")}
+    given = {name: getattr(arguments, name) for name in ("model", "scan", "size", "holdout", "layout", "reference")}
     evaluation = evaluate(
         **given,
         weights=arguments.lpips_weights,
@@ -195,18 +216,14 @@ def _compare(arguments: argparse.Namespace) -> int:
 
 
 def _bench(arguments: argparse.Namespace) -> int:
-    from advtex_engine.bench import bench, print_table
+    from advtex_engine.bench import run
 
-    result = bench(arguments.device, arguments.width, arguments.height, arguments.preset)
-    if arguments.json:
-        print(json.dumps(result))
-    else:
-        print_table(result)
-    return 0
+    return run(arguments)
 
 
 _COMMANDS = {
     "texture": _texture,
+    "check": _check,
     "evaluate": _evaluate,
     "synthesize": _synthesize,
     "compare": _compare,

@@ -10,6 +10,8 @@ Images [N,C,H,W]; offsets in pixels, x then y. The offsets are constants to auto
 
 from __future__ import annotations
 
+import functools
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -40,12 +42,11 @@ def block_offsets(reference: Tensor, examples: Tensor, mask: Tensor, bound: int)
     assert examples.shape[1:] == (3, height, width) and mask.shape == (1, 1, height, width)
     detail = _detail(torch.cat((reference, examples)), mask)
     blocks = detail.unfold(1, BLOCK, BLOCK // 2).unfold(2, BLOCK, BLOCK // 2)
-    window = torch.hann_window(BLOCK, periodic=False, device=reference.device)
-    spectrum = torch.fft.rfft2(blocks * (window[:, None] * window))
+    spectrum = torch.fft.rfft2(blocks * _window(reference.device))
     cross = spectrum[1:] * spectrum[:1].conj()
-    energy = cross.abs().pow(1 - WHITENING)
-    correlation = torch.fft.irfft2(cross / (cross.abs().pow(WHITENING) + 1e-6), s=(BLOCK, BLOCK))
-    highest = torch.fft.irfft2(energy.to(cross.dtype), s=(BLOCK, BLOCK))[..., 0, 0]
+    strength = cross.abs()
+    correlation = torch.fft.irfft2(cross / (strength.pow(WHITENING) + 1e-6), s=(BLOCK, BLOCK))
+    highest = _mean_of_half_spectrum(strength.pow_(1 - WHITENING))
     best, place = correlation.flatten(-2).max(-1)
     y, x = place // BLOCK, place % BLOCK
     x, y = x - BLOCK * (x >= BLOCK // 2), y - BLOCK * (y >= BLOCK // 2)
@@ -62,30 +63,68 @@ def shift(images: Tensor, offsets: Tensor) -> Tensor:
 
     Bilinear, differentiable in the images; the border is repeated outward.
     """
-    count, _, height, width = images.shape
-    assert offsets.shape[0] == count and offsets.shape[3] == 2
-    xy = torch.stack(
-        torch.meshgrid(
-            torch.arange(width, device=images.device) + 0.5,
-            torch.arange(height, device=images.device) + 0.5,
-            indexing="xy",
-        ),
-        -1,
-    )
+    return move(images, moved_positions(offsets, images.shape[-2:]))
+
+
+def moved_positions(offsets: Tensor, size: tuple[int, int] | torch.Size) -> Tensor:
+    """x + offset(x) [N,H,W,2] for images of `size` (H, W), in units of -1 to 1 from border to border."""
+    height, width = size
+    count, rows, columns, two = offsets.shape
+    assert two == 2
+    x = torch.arange(width, device=offsets.device) + 0.5
+    y = torch.arange(height, device=offsets.device) + 0.5
+    xy = torch.stack((x.expand(height, -1), y[:, None].expand(-1, width)), -1)
     # In units of blocks from the first center; beyond the outer centers the offset is theirs.
-    grid_size = torch.tensor(offsets.shape[2:0:-1], device=images.device)
-    at = (xy - BLOCK / 2) / (BLOCK // 2) / (grid_size - 1).clamp(min=1) * 2 - 1
+    step = BLOCK // 2
+    at_x = (x - BLOCK / 2) * (2 / (step * max(columns - 1, 1))) - 1
+    at_y = (y - BLOCK / 2) * (2 / (step * max(rows - 1, 1))) - 1
+    at = torch.stack((at_x.expand(height, -1), at_y[:, None].expand(-1, width)), -1)
     field = F.grid_sample(
         offsets.permute(0, 3, 1, 2), at.expand(count, -1, -1, -1), align_corners=True, padding_mode="border"
     )
-    target = (xy + field.permute(0, 2, 3, 1)) / xy.new_tensor((width, height)) * 2 - 1
-    return F.grid_sample(images, target, align_corners=False, padding_mode="border")
+    moved = xy + field.permute(0, 2, 3, 1)
+    return torch.stack((moved[..., 0] * (2 / width) - 1, moved[..., 1] * (2 / height) - 1), -1)
+
+
+def move(images: Tensor, positions: Tensor) -> Tensor:
+    """images [N,C,H,W] at `moved_positions` [N,H,W,2]."""
+    assert positions.shape == (images.shape[0], *images.shape[2:], 2)
+    return F.grid_sample(images, positions, align_corners=False, padding_mode="border")
+
+
+@functools.cache
+def _window(device: torch.device) -> Tensor:
+    """[BLOCK,BLOCK], which fades out towards the block's border."""
+    window = torch.hann_window(BLOCK, periodic=False, device=device)
+    square: Tensor = window[:, None] * window
+    return square
+
+
+def _mean_of_half_spectrum(half: Tensor) -> Tensor:
+    """Mean of a real, even spectrum [...,BLOCK,BLOCK] of which the columns [...,BLOCK,BLOCK // 2 + 1] are given."""
+    twice = half[..., 1:-1].sum((-2, -1))
+    mean: Tensor = (half[..., 0].sum(-1) + half[..., -1].sum(-1) + 2 * twice) / BLOCK**2
+    return mean
 
 
 def _detail(images: Tensor, mask: Tensor) -> Tensor:
     """Luminance without its local mean, 0 outside the mask [N,H,W]."""
-    weights = images.new_tensor((0.299, 0.587, 0.114)).view(1, 3, 1, 1)
-    luminance = (images * weights).sum(1, keepdim=True) * mask
-    rows = F.avg_pool2d(luminance, (DETAIL, 1), 1, (DETAIL // 2, 0))
-    smooth = F.avg_pool2d(rows, (1, DETAIL), 1, (0, DETAIL // 2))
+    red, green, blue = images[:, :1], images[:, 1:2], images[:, 2:]
+    luminance = (0.299 * red + 0.587 * green + 0.114 * blue) * mask
+    smooth = _box_mean(_box_mean(luminance, 2), 3)
     return ((luminance - smooth) * mask)[:, 0]
+
+
+def _box_mean(images: Tensor, dim: int) -> Tensor:
+    """Means of [N,1,H,W] over DETAIL pixels along one side, zero beyond the border."""
+    half = DETAIL // 2
+    if images.is_cuda:
+        along, padding = ((DETAIL, 1), (half, 0)) if dim == 2 else ((1, DETAIL), (0, half))
+        return F.avg_pool2d(images, along, 1, padding)
+    # The same sums in the same order, ten times as fast: a CPU's pooling adds up value by value.
+    count = images.shape[dim]
+    padded = F.pad(images, (0, 0, half, half) if dim == 2 else (half, half))
+    total = padded.narrow(dim, 0, count) + padded.narrow(dim, 1, count)
+    for place in range(2, DETAIL):
+        total += padded.narrow(dim, place, count)
+    return total.div_(DETAIL)

@@ -3,40 +3,34 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 import torch
-import xatlas
 
+from advtex_engine.chart_cache import ChartMaker
+from advtex_engine.charting import PADDING, Charts, Floats, Integers, make_charts, pack_charts
 from advtex_engine.config import TextureConfig
 from advtex_engine.density import face_areas, pixel_density
 from advtex_engine.errors import OptionError, Problem, ScanError
 from advtex_engine.monitor import Monitor
 from advtex_engine.scene import Atlas, Camera, Mesh
 
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
-
 # The texture's sides are multiples of this, so that coarse levels of a pyramid divide them.
 SIZE_STEP = 64
 MIN_SIZE = 256
-# Texels around each chart, so that twice as many lie between two: bilinear sampling touches one on either side, and
-# as much is left at half the size, which coarse pyramid levels sample.
-PADDING = 2
-# xatlas grows a chart up to this cost; its default of 2 makes a tenth more charts, and more than 8 changes nothing.
-CHART_COST = 8.0
-# Charts are grown in blocks of at most so many faces: xatlas's time grows faster than a block's size, and blocks run
-# side by side on several cores, with the same result. 80k faces: 8 s instead of 22 s on one core, as many charts.
-BLOCK_FACES = 3_000
+# Viewers and phones take images up to this side. A larger texture is made of PAGES x PAGES pages, one image each.
+MAX_PAGE = 8192
+PAGES = 2
 # Texel density of what no camera sees, and the least of what one does, relative to the scan's mean density.
 UNSEEN_DENSITY = 0.05
 # Each round of packing shrinks the charts by what they overshot the cap, and a little more.
 PACKING_ROUNDS = 8
 SHRINK_MARGIN = 0.99
+# In average faces. Charts below are not packed: scaled up to the size they want, they would leave the texture.
+MIN_CHART_AREA = 1e-12
 
 # Rows of triangles that texel_coverage holds at a time; each takes about 150 bytes.
 ROWS_AT_A_TIME = 1_000_000
@@ -49,11 +43,18 @@ MAX_COLLAPSED = 0.02  # share of the surface whose uv triangles have no area
 MIN_USED = 0.1  # share of the texture that is covered at all
 
 
-def build_atlas(mesh: Mesh, cameras: Sequence[Camera], config: TextureConfig, monitor: Monitor) -> Atlas:
+ChartFunction = Callable[[npt.NDArray[np.float32], Integers, Monitor], Charts]
+
+
+def build_atlas(
+    mesh: Mesh, cameras: Sequence[Camera], config: TextureConfig, monitor: Monitor, charts: ChartMaker | None = None
+) -> Atlas:
     """Give every face its own texels: about config.texels_per_pixel per pixel (along an edge) where it is seen best.
 
     mesh: cleaned. cameras: those of the views, at the working size. The texture is square, its side a multiple of
-    SIZE_STEP and at most config.max_texture_size. Same input, same atlas. Not differentiable.
+    SIZE_STEP and at most config.max_texture_size; new charts that need more than MAX_PAGE are laid out in pages. Same
+    input, same atlas. Not differentiable. Raises Stopped when the monitor asks for it. charts: where they may have been
+    begun or kept.
     """
     wanted = _wanted_texels(mesh, cameras, config.texels_per_pixel)
     if mesh.v_uv is not None:
@@ -68,7 +69,13 @@ def build_atlas(mesh: Mesh, cameras: Sequence[Camera], config: TextureConfig, mo
                 "none needed; upload a mesh whose uv do not overlap to keep them",
             )
         )
-    return _new_atlas(mesh, wanted, config)
+    return _new_atlas(mesh, wanted, config, monitor, make_charts if charts is None else charts.make)
+
+
+def begin_charts(mesh: Mesh, charts: ChartMaker) -> None:
+    """Begins with the charts that `build_atlas` will want for this mesh, unless it brings uv that may be kept."""
+    if mesh.v_uv is None:
+        charts.begin(_at_xatlas_scale(mesh), mesh.t_pos_idx.numpy())
 
 
 def _wanted_texels(mesh: Mesh, cameras: Sequence[Camera], texels_per_pixel: float) -> Floats:
@@ -131,58 +138,30 @@ def _count_islands(t_uv_idx: Integers) -> int:
 # New charts -----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Charts:
-    """uv [U,2] in chart-local units, face indices into it [T,3], chart of each face [T] (-1 = none)."""
-
-    uv: Floats
-    faces: Integers
-    chart: Integers
-
-
-def _new_atlas(mesh: Mesh, wanted: Floats, config: TextureConfig) -> Atlas:
-    charts = _make_charts(mesh)
+def _new_atlas(mesh: Mesh, wanted: Floats, config: TextureConfig, monitor: Monitor, make: ChartFunction) -> Atlas:
+    charts = make(_at_xatlas_scale(mesh), mesh.t_pos_idx.numpy(), monitor)
     charts = replace(charts, uv=_scale_charts(charts, wanted))
-    cap = _cap(config)
+    pages, cap = 1, _cap(config)
     for _ in range(PACKING_ROUNDS):
-        texel, side = _pack(charts)
-        if _round_up(side) <= cap:
-            size = _round_up(side)
+        texel, page, side = _lay_out(charts, pages, monitor)
+        if side > MAX_PAGE and pages < PAGES and cap > MAX_PAGE:
+            pages = PAGES
+            continue
+        limit = min(cap // pages, MAX_PAGE) // SIZE_STEP * SIZE_STEP
+        if _round_up(side) <= limit:
+            step = _round_up(side)
+            corner = np.stack([page % pages, page // pages], axis=1) * step
             packed = replace(
                 mesh,
-                v_uv=torch.from_numpy((texel / size).astype(np.float32)),
+                v_uv=torch.from_numpy(((texel + corner) / (step * pages)).astype(np.float32)),
                 t_uv_idx=torch.from_numpy(charts.faces),
             )
-            return Atlas(packed, size, size, "xatlas", int(charts.chart.max()) + 1)
-        charts = replace(charts, uv=charts.uv * (cap / side * SHRINK_MARGIN))
+            return Atlas(packed, step * pages, step * pages, "xatlas", int(charts.chart.max()) + 1, pages)
+        charts = replace(charts, uv=charts.uv * (limit / side * SHRINK_MARGIN))
     raise OptionError(
         f"the mesh's {charts.chart.max() + 1:,} charts do not fit a texture of {cap} texels; raise the maximal texture "
         "size, lower the face budget, or remove small loose pieces from the mesh"
     )
-
-
-def _make_charts(mesh: Mesh) -> _Charts:
-    """Cut the mesh into charts (xatlas) and flatten them. Faces and their corners keep their order."""
-    atlas = xatlas.Atlas()
-    position, faces = _at_xatlas_scale(mesh), mesh.t_pos_idx.numpy()
-    blocks = _split(position[faces].mean(axis=1), np.arange(len(faces)))
-    for block in blocks:
-        used, local = np.unique(faces[block], return_inverse=True)
-        atlas.add_mesh(position[used], local.reshape(-1, 3).astype(np.uint32))
-    options = xatlas.ChartOptions()
-    options.max_cost = CHART_COST
-    atlas.generate(options, _pack_options())
-    t_uv_idx, chart = np.zeros_like(faces), np.zeros(len(faces), dtype=np.int64)
-    uv, vertices, charts = list[Floats](), 0, 0
-    for index, block in enumerate(blocks):
-        mapping, local, block_uv = atlas[index]
-        assert np.array_equal(np.unique(faces[block])[mapping[local]], faces[block])
-        t_uv_idx[block] = local.astype(np.int64) + vertices
-        for number in range(atlas.get_mesh_chart_count(index)):
-            chart[block[np.asarray(atlas.get_mesh_chart(index, number).faces)]] = charts + number
-        uv.append(block_uv * np.array([atlas.width, atlas.height], dtype=np.float64))
-        vertices, charts = vertices + len(block_uv), charts + atlas.get_mesh_chart_count(index)
-    return _Charts(np.concatenate(uv), t_uv_idx, chart)
 
 
 def _at_xatlas_scale(mesh: Mesh) -> npt.NDArray[np.float32]:
@@ -191,55 +170,44 @@ def _at_xatlas_scale(mesh: Mesh) -> npt.NDArray[np.float32]:
     return ((mesh.v_pos.double() - mesh.v_pos.double().mean(dim=0)) / unit).float().numpy()
 
 
-def _split(centroid: npt.NDArray[np.float32], faces: Integers) -> list[Integers]:
-    """Halve a set of faces along its longest axis until each part has at most BLOCK_FACES."""
-    if len(faces) <= BLOCK_FACES:
-        return [faces]
-    place = centroid[faces]
-    axis = int(np.argmax(place.max(axis=0) - place.min(axis=0)))
-    order = faces[np.argsort(place[:, axis], kind="stable")]
-    half = len(order) // 2
-    return _split(centroid, np.sort(order[:half])) + _split(centroid, np.sort(order[half:]))
-
-
-def _scale_charts(charts: _Charts, wanted: Floats) -> Floats:
-    """uv in texels: each chart as large as its faces want to be together."""
+def _scale_charts(charts: Charts, wanted: Floats) -> Floats:
+    """uv in texels: each chart as large as its faces want to be together, one without area at the origin."""
     count = int(charts.chart.max()) + 1
     placed = charts.chart >= 0
     have = np.bincount(charts.chart[placed], _uv_areas(charts.uv[charts.faces])[placed], count)
     want = np.bincount(charts.chart[placed], wanted[placed], count)
-    scale = np.sqrt(want / np.maximum(have, 1e-12))
+    scale = np.where(have > MIN_CHART_AREA, np.sqrt(want / np.maximum(have, MIN_CHART_AREA)), 0.0)
     per_vertex = np.ones(len(charts.uv))
     per_vertex[charts.faces[placed]] = scale[charts.chart[placed], None]
     return charts.uv * per_vertex[:, None]
 
 
-def _pack(charts: _Charts) -> tuple[Floats, int]:
-    """Place the charts at their scale: texel coordinates [U,2] and the side that holds them."""
-    atlas = xatlas.Atlas()
-    atlas.add_uv_mesh(charts.uv.astype(np.float32), charts.faces.astype(np.uint32))
-    atlas.generate(xatlas.ChartOptions(), _pack_options(texels_per_unit=1.0))
-    mapping, faces, uv = atlas[0]
-    assert atlas.atlas_count == 1
-    assert np.array_equal(mapping[faces], charts.faces)
-    texel = np.zeros_like(charts.uv)
-    texel[mapping] = uv * np.array([atlas.width, atlas.height], dtype=np.float64)
-    return texel, max(atlas.width, atlas.height)
+def _lay_out(charts: Charts, pages: int, monitor: Monitor) -> tuple[Floats, Integers, int]:
+    """Pack charts into pages x pages pages: texel coordinates within the page [U,2], page [U], side of a page.
 
-
-def _pack_options(texels_per_unit: float = 0.0) -> Any:
-    """Charts go where there is room first: brute force takes minutes, alignment to blocks costs 5 % of the area.
-
-    xatlas's `resolution` is no cap, so none is given.
+    Charts follow each other in space, and pages take equal shares of their area in that order. Where pages meet,
+    charts keep their distance to the border.
     """
-    options = xatlas.PackOptions()
-    options.padding = PADDING
-    options.bilinear = False
-    options.blockAlign = False
-    options.bruteForce = False
-    options.create_image = False
-    options.texels_per_unit = texels_per_unit
-    return options
+    if pages == 1:
+        ((texel, side),) = pack_charts([(charts.uv, charts.faces)], monitor)
+        return texel, np.zeros(len(texel), dtype=np.int64), side
+    size = np.bincount(charts.chart + 1, _uv_areas(charts.uv[charts.faces]))
+    page_of_chart = ((np.cumsum(size) - size / 2) / size.sum() * pages**2).astype(np.int64)
+    face_page = page_of_chart[charts.chart + 1]
+    shares = [np.flatnonzero(face_page == page) for page in np.unique(face_page)]
+    used = [np.unique(charts.faces[share]) for share in shares]
+    packed = pack_charts(
+        [
+            (charts.uv[mine], np.searchsorted(mine, charts.faces[share]))
+            for share, mine in zip(shares, used, strict=True)
+        ],
+        monitor,
+    )
+    texel, page = np.zeros_like(charts.uv), np.zeros(len(charts.uv), dtype=np.int64)
+    for share, mine, (placed, _) in zip(shares, used, packed, strict=True):
+        texel[mine], page[mine] = placed + PADDING, face_page[share[0]]
+    assert (page[charts.faces] == face_page[:, None]).all()
+    return texel, page, max(side for _, side in packed) + 2 * PADDING
 
 
 def _round_up(side: float) -> int:

@@ -1,7 +1,7 @@
 """One pair of views per step: the source, the auxiliary view warped into it, and where the source samples the texture.
 
-All draws come from one generator on the device, and nothing in `draw` waits for the device: the crop's size is fixed
-and only its offset is drawn.
+All draws come from one generator on the device, and nothing in `draw` waits for the device or is known to the host: the
+crop's size is fixed and only its offset is drawn.
 """
 
 from __future__ import annotations
@@ -27,6 +27,17 @@ class Batch:
     visible: Tensor
     slots: Tensor
     weights: Tensor
+
+
+@dataclass(frozen=True)
+class Choice:
+    """[1] int64 each: the source and its auxiliary view, the pair's row in pairs.relative, the crop's corner."""
+
+    source: Tensor
+    auxiliary: Tensor
+    pair: Tensor
+    left: Tensor
+    top: Tensor
 
 
 class PairSampler:
@@ -56,27 +67,19 @@ class PairSampler:
         self._window_xy = torch.stack((columns.repeat(len(rows)), rows.repeat_interleave(len(columns))), 1) + 0.5
         self._texture_size = torch.tensor(maps.slot_map.shape[::-1], dtype=torch.float32, device=self.device)
         self._slot_map = maps.slot_map.flatten()
+        # On the device, so that maps and pairs may be refilled in place under a captured step.
+        self.source_count = torch.tensor([pairs.sources.shape[0]], device=self.device)
 
     def draw(self) -> Batch:
         """A random pair and crop, with the auxiliary view warped into the source."""
-        maps = self.maps
-        random = torch.rand(4, generator=self.generator, device=self.device)
-        source = self.pairs.sources[_pick(random[0], self.pairs.sources.shape[0])]
-        candidate = _pick(random[1], self.pairs.count[source])
-        auxiliary = self.pairs.auxiliary[source, candidate]
-        width, height = self.crop
-        left = _pick(random[2], maps.width - width + 1)
-        top = _pick(random[3], maps.height - height + 1)
-        pixels = self._window + (top * maps.width + left)
-        flat = pixels + source * (maps.width * maps.height)
-        depth = maps.depth.view(-1).index_select(0, flat).to(torch.float32)
+        maps, chosen = self.maps, self.choose()
+        flat = self.pixels(chosen)
+        depth = self.depth(flat)
         foreground = depth > 0
-        points = unproject_pixels(self._window_xy + torch.stack((left, top)), depth, maps.intrinsics[source])
-        relative = self.pairs.relative[source, candidate]
-        if self.perturbation:
-            distance = depth.sum() / foreground.sum().clamp(min=1)
-            relative = self._virtual(relative, distance / maps.intrinsics[auxiliary][0], distance)
-        real, visible = reproject(points, relative, maps, auxiliary, self.tolerance)
+        xy = self._window_xy + torch.cat((chosen.left, chosen.top))
+        points = unproject_pixels(xy, depth, _row(maps.intrinsics, chosen.source))
+        relative = self.relative(chosen, depth)
+        real, visible = reproject(points, relative, maps, chosen.auxiliary[0], self.tolerance)
         visible = visible & foreground
         uv = decode_uv(maps.uv.view(-1, 2).index_select(0, flat))
         texels, weights = bilinear_footprint(uv * self._texture_size, maps.slot_map.shape[1], maps.slot_map.shape[0])
@@ -91,6 +94,34 @@ class PairSampler:
             weights=weights * visible[:, None],
         )
 
+    def choose(self) -> Choice:
+        """A source, one of its candidates and a crop's corner, all uniform."""
+        pairs, (width, height) = self.pairs, self.crop
+        random = torch.rand((4, 1), generator=self.generator, device=self.device)
+        source = pairs.sources.index_select(0, _pick(random[0], self.source_count))
+        candidate = _pick(random[1], pairs.count.index_select(0, source))
+        pair = source * pairs.auxiliary.shape[1] + candidate
+        auxiliary = pairs.auxiliary.view(-1).index_select(0, pair)
+        left, top = _pick(random[2], self.maps.width - width + 1), _pick(random[3], self.maps.height - height + 1)
+        return Choice(source, auxiliary, pair, left, top)
+
+    def pixels(self, chosen: Choice) -> Tensor:
+        """[P] of the crop, among those of all views in a row."""
+        maps = self.maps
+        return self._window + (chosen.top * maps.width + chosen.left) + chosen.source * (maps.width * maps.height)
+
+    def depth(self, pixels: Tensor) -> Tensor:
+        """[P] float32 metres of `pixels`."""
+        return self.maps.depth.view(-1).index_select(0, pixels).to(torch.float32)
+
+    def relative(self, chosen: Choice, depth: Tensor) -> Tensor:
+        """[3,4] source camera to auxiliary camera, a virtual one with perturbation; depth: [P] of the crop."""
+        relative = _row(self.pairs.relative.view(-1, 3, 4), chosen.pair)
+        if not self.perturbation:
+            return relative
+        distance = depth.sum() / (depth > 0).sum().clamp(min=1)
+        return self._virtual(relative, distance / _row(self.maps.intrinsics, chosen.auxiliary)[0], distance)
+
     def _virtual(self, relative: Tensor, per_pixel: Tensor, distance: Tensor) -> Tensor:
         """The pose [3,4] of a virtual camera near that of `relative`; per_pixel: metres of a pixel at `distance`."""
         random = 2 * torch.rand(6, generator=self.generator, device=self.device) - 1
@@ -102,6 +133,11 @@ class PairSampler:
     def image(self, rows: Tensor) -> Tensor:
         """Rows [h*w,C] as an image [1,C,h,w] (channels_last memory, no copy)."""
         return rows.view(1, self.crop[1], self.crop[0], rows.shape[1]).permute(0, 3, 1, 2)
+
+
+def _row(table: Tensor, index: Tensor) -> Tensor:
+    """The row of a [1] index; table[index] with a 0-dim index would wait for the device."""
+    return table.index_select(0, index)[0]
 
 
 def _pick(random: Tensor, count: int | Tensor) -> Tensor:

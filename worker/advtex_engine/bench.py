@@ -1,11 +1,18 @@
-"""Times the optimization's step and its parts on a device, beside the operations that they need.
+"""Times a step of the optimization with its parts, and the stages around it, beside what the device could do at best.
 
-The scene is made here, so that only torch is needed: a textured square seen by views whose images are shifted.
+    advtex-engine bench --json          python -m advtex_engine.bench --json
+
+The scene is made here (`bench_scene`), so that only torch and numpy are needed: this package on the PYTHONPATH of a
+bare GPU machine is enough. The floor of a part is the time of its bytes at the speed of a large copy and of its
+operations at that of a large matrix product, both measured on the device in the same run. On a CPU, what fits into a
+core's cache may be faster than its floor.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
+import os
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -16,35 +23,21 @@ import torch
 from torch import Tensor
 
 from advtex_engine.batches import Batch
+from advtex_engine.bench_counts import Work, step_flops, step_parts
+from advtex_engine.bench_limits import Limits, measure_limits
+from advtex_engine.bench_options import FACES, VIEWS, add_bench_options
+from advtex_engine.bench_scene import made_scene
+from advtex_engine.bench_stages import Stage, time_stages
 from advtex_engine.config import PRESETS, Preset
+from advtex_engine.devices import choose_device, wait_for
 from advtex_engine.discriminator import PatchDiscriminator
+from advtex_engine.graphed import Stepper
 from advtex_engine.optimize import AdversarialOptimizer, Losses
-from advtex_engine.planar import planar_views
 from advtex_engine.views import Pairs, ViewMaps
 
-VIEWS = 8
-TEXELS_PER_PIXEL = 1.2
 WARMUP, STEPS = 5, 30
-LAYERS = ((6, 64, 2), (64, 128, 2), (128, 128, 2), (128, 128, 1), (128, 1, 1))
-
-
-def discriminator_flops(width: int, height: int) -> list[int]:
-    """Floating-point operations (2 per multiply-add) of each layer's forward pass on one image of width x height."""
-    counts = []
-    for inputs, outputs, stride in LAYERS:
-        width, height = (width - 2) // stride + 1, (height - 2) // stride + 1
-        counts.append(2 * 16 * inputs * outputs * width * height)
-    return counts
-
-
-def step_flops(width: int, height: int) -> int:
-    """Of one step's convolutions.
-
-    Two forward passes; for each a weight gradient, and an input gradient except in the first layer; and one input
-    gradient through all layers for the texture.
-    """
-    layers = discriminator_flops(width, height)
-    return 2 * sum(layers) + 2 * sum(layers) + 2 * sum(layers[1:]) + sum(layers)
+WARM_LAUNCHES, LAUNCHES = 2, 3  # of many steps each, where there are such; the fewest that are timed
+MANY = 1_000_000
 
 
 class _Full(AdversarialOptimizer):
@@ -65,7 +58,7 @@ class _Timed(_Full):
     def _time(self, name: str, part: Callable[..., Any], *args: Any) -> Any:
         started = time.perf_counter()
         result = part(*args)
-        _wait(self.device)
+        wait_for(self.device)
         self.seconds[name] += time.perf_counter() - started
         return result
 
@@ -85,47 +78,101 @@ class _Timed(_Full):
         self._time("texture update", super().update_texture, gradient)
 
 
-def bench(device_name: str, width: int, height: int, preset_name: str) -> dict[str, Any]:
-    """Median milliseconds of a step over STEPS steps, then the share of each part in as many more.
+def bench(
+    device_name: str, width: int, height: int, preset_name: str, *, views: int = VIEWS, faces: int = FACES
+) -> dict[str, Any]:
+    """Times of a step (median and least over STEPS), of its parts in as many more, and of the stages, with floors.
 
-    width, height: of the views, in pixels; a step, and so the FLOP count, is of the crop that the preset takes of
-    them. Every step updates both players, so a real run, which skips some of the discriminator's updates, is faster.
+    width, height: of the views, in pixels; a step is of the crop that the preset takes of them. views, faces: of the
+    scene. Every step updates both players, so a real run, which skips some of the discriminator's updates, is faster.
     """
-    from advtex_engine.pipeline import choose_device
-
     device = choose_device(device_name)
-    maps, pairs = planar_views(VIEWS, width, height, TEXELS_PER_PIXEL, device)
-    plain, timed = (_optimizer(kind, maps, pairs, PRESETS[preset_name], device) for kind in (_Full, _Timed))
-    times = []
-    for index in range(WARMUP + STEPS):
-        started = time.perf_counter()
-        plain.step()
-        _wait(device)
-        if index >= WARMUP:
-            times.append(time.perf_counter() - started)
+    load = os.getloadavg()[0]
+    scene, atlas = made_scene(faces, views, width, height)
+    stages, maps, pairs = time_stages(scene, atlas, device)
+    preset = PRESETS[preset_name]
+    plain, timed = full_optimizer(maps, pairs, preset), _begun(_Timed, maps, pairs, preset)
     assert isinstance(timed, _Timed)
+    limits = measure_limits(device, torch.bfloat16 if plain.bfloat16 else torch.float32)
+    stepper = Stepper(plain)
+    times = step_times(stepper)
     for index in range(WARMUP + STEPS):
         if index == WARMUP:
             timed.seconds.clear()
         timed.step()
-    step_ms = sorted(times)[len(times) // 2] * 1e3
+    works = step_parts(*plain.crop, maps.slots, 2 if plain.bfloat16 else 4)
+    least, median = min(times), sorted(times)[len(times) // 2]
     flops = step_flops(*plain.crop)
+    floor = sum(limits.floor(work.flops, work.bytes) for work in works.values())
     whole = sum(timed.seconds.values())
     return {
         "device": device.type if device.type == "cpu" else torch.cuda.get_device_name(device),
         "threads": torch.get_num_threads(),
-        "precision": "bf16" if plain.bfloat16 else "fp32",
+        "load": round(load, 2),
+        "torch": torch.__version__,
+        **stepper.describe(),
+        "product_gflops_per_second": round(limits.flops / 1e9, 1),
+        "copy_gb_per_second": round(limits.bytes / 1e9, 2),
+        "upload_gb_per_second": round(limits.upload / 1e9, 2),
         "preset": preset_name,
         "width": width,
         "height": height,
         "crop": list(plain.crop),
+        "views": len(scene.views),
+        "faces": len(scene.mesh.t_pos_idx),
+        "texture": atlas.width,
         "texels": maps.slots,
-        "step_ms": round(step_ms, 3),
-        "step_ms_least": round(min(times) * 1e3, 3),
+        "step_ms": round(median * 1e3, 3),
+        "step_ms_least": round(least * 1e3, 3),
+        "steps_per_second": round(1 / median, 2),
         "flops": flops,
-        "gflops_per_second": round(flops / step_ms / 1e6, 1),
-        "share": {name: round(seconds / whole, 3) for name, seconds in timed.seconds.items()},
+        "bytes": round(sum(work.bytes for work in works.values())),
+        "gflops_per_second": round(flops / median / 1e9, 1),
+        "floor_ms": _ms(floor),
+        "ratio": round(median / floor, 2),
+        "parts": {
+            name: {**_row(seconds / STEPS, works[name], limits), "share": round(seconds / whole, 3)}
+            for name, seconds in timed.seconds.items()
+        },
+        "stages": {name: _stage_row(stage, limits) for name, stage in stages.items()},
     }
+
+
+def step_times(stepper: Stepper) -> list[float]:
+    """Seconds per step of about STEPS steps, taken as a run takes them: many at once where a graph can hold them."""
+    device, taken, times = stepper.optimizer.device, 0, list[float]()
+    while taken < WARMUP + WARM_LAUNCHES * (stepper.steps_per_launch - 1):
+        taken += stepper.take(MANY)
+    while len(times) < max(LAUNCHES, STEPS / stepper.steps_per_launch):
+        wait_for(device)
+        started = time.perf_counter()
+        taken = stepper.take(MANY)
+        wait_for(device)
+        times.append((time.perf_counter() - started) / taken)
+    return times
+
+
+def _row(seconds: float, work: Work, limits: Limits) -> dict[str, Any]:
+    floor = limits.floor(work.flops, work.bytes, work.uploaded)
+    return {
+        "ms": _ms(seconds),
+        "gflop": float(f"{work.flops / 1e9:.4g}"),
+        "mb": float(f"{(work.bytes + work.uploaded) / 1e6:.4g}"),
+        "floor_ms": _ms(floor),
+        "ratio": round(seconds / floor, 2),
+    }
+
+
+def _stage_row(stage: Stage, limits: Limits) -> dict[str, Any]:
+    if stage.seconds is None:
+        return {"skipped": stage.left_out}
+    if stage.work is None:
+        return {"ms": _ms(stage.seconds)}
+    return _row(stage.seconds, stage.work, limits)
+
+
+def _ms(seconds: float) -> float:
+    return float(f"{seconds * 1e3:.4g}")
 
 
 def print_table(result: dict[str, Any]) -> None:
@@ -133,24 +180,63 @@ def print_table(result: dict[str, Any]) -> None:
     whole, crop = ("x".join(map(str, size)) for size in ((result["width"], result["height"]), result["crop"]))
     print(f"preset {result['preset']}, crops of {crop} from full frames of {whole}")
     for key, value in result.items():
-        if key not in ("preset", "width", "height", "crop"):
-            print(f"{key:32} {json.dumps(value)}")
+        if key not in ("preset", "width", "height", "crop", "parts", "stages"):
+            print(f"{key:36} {value}")
+    for table, title in (("parts", "part of a step"), ("stages", "stage")):
+        print(f"\n{title:36} {'ms':>10} {'GFLOP':>10} {'MB':>10} {'floor ms':>10} {'ratio':>8}")
+        for name, row in result[table].items():
+            if "skipped" in row:
+                print(f"{name:36} skipped: {row['skipped']}")
+                continue
+            cells = (row.get(key, "-") for key in ("gflop", "mb", "floor_ms"))
+            print(
+                f"{name:36} {row['ms']:10} "
+                + " ".join(f"{cell:>10}" for cell in cells)
+                + f" {row.get('ratio', '-'):>8}"
+            )
 
 
-def _optimizer(
-    kind: type[AdversarialOptimizer], maps: ViewMaps, pairs: Pairs, preset: Preset, device: torch.device
-) -> AdversarialOptimizer:
+def full_optimizer(maps: ViewMaps, pairs: Pairs, preset: Preset) -> AdversarialOptimizer:
+    """Of an object, without the discriminator's pauses, at the first step after the pretraining."""
+    return _begun(_Full, maps, pairs, preset)
+
+
+def _begun(kind: type[AdversarialOptimizer], maps: ViewMaps, pairs: Pairs, preset: Preset) -> AdversarialOptimizer:
     """At the first step after the pretraining, in which the texture waits."""
+    device = maps.device
     discriminator = PatchDiscriminator(torch.Generator().manual_seed(0)).to(device)
     generator = torch.Generator(device).manual_seed(0)
     start = torch.zeros((maps.slots, 3), device=device)
     optimizer = kind(
-        maps, pairs, start, preset, kind="scene", steps=preset.steps, generator=generator, discriminator=discriminator
+        maps, pairs, start, preset, kind="object", steps=preset.steps, generator=generator, discriminator=discriminator
     )
     optimizer.index = preset.pretraining
     return optimizer
 
 
-def _wait(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
+def run(arguments: argparse.Namespace) -> int:
+    """The command."""
+    result = bench(
+        arguments.device,
+        arguments.width,
+        arguments.height,
+        arguments.preset,
+        views=arguments.views,
+        faces=arguments.faces,
+    )
+    if arguments.json:
+        print(json.dumps(result))
+    else:
+        print_table(result)
+    return 0
+
+
+def main() -> int:
+    """`python -m advtex_engine.bench`: the command where nothing but this package, torch and numpy is installed."""
+    parser = argparse.ArgumentParser(prog="advtex_engine.bench", description=__doc__)
+    add_bench_options(parser)
+    return run(parser.parse_args())
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -148,7 +148,8 @@ def _sample(
 ) -> tuple[Tensor, Tensor]:
     """Safety [P] in [0,1], 0 where the view does not see the point, and its color [P,3] uint8; of points `which`."""
     indices, weights = bilinear_footprint(pixel[which], maps.width, maps.height)
-    view_depth = maps.depth[view].to(torch.float32)
+    maps = maps.only(view)
+    view_depth = maps.depth[0].to(torch.float32)
     surface = view_depth[indices]
     # The best of four pixels decides, or else every point beside an occluding edge would count as hidden.
     apart = torch.where(surface > 0, (surface - depth[which, None]).abs(), torch.inf).amin(1)
@@ -157,7 +158,7 @@ def _sample(
     safe = torch.zeros_like(depth)
     safe[which] = torch.where(apart < tolerance, reliable, 0.0)
     color = torch.zeros((len(pixel), 3), dtype=torch.uint8, device=pixel.device)
-    image = maps.color[view].to(torch.float32)
+    image = maps.color[0].to(torch.float32)
     color[which] = F.embedding_bag(indices, image, per_sample_weights=weights, mode="sum").round().to(torch.uint8)
     return safe, color
 
@@ -202,7 +203,7 @@ def frame_blur(maps: ViewMaps) -> Tensor:
     """
     ratios = []
     for view in range(maps.count):
-        gray = luminance(maps.color[view]).view(1, 1, maps.height, maps.width)
+        gray = luminance(maps.color[view].to(maps.device)).view(1, 1, maps.height, maps.width)
         coarse = F.avg_pool2d(gray, 2)
         ratios.append(_gradient(gray) / _gradient(coarse).clamp(min=1e-6))
     ratio = torch.stack(ratios).clamp(min=1e-6).log()

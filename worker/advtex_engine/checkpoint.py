@@ -26,7 +26,7 @@ class WorkFolder:
     """Named dictionaries of tensors and plain values below `path`, tied to `fingerprint`.
 
     save: atomic and durable, then reported to the monitor; OSError when the disk is full. load: None when absent,
-    unreadable or of another run.
+    unreadable or of another run; tensors that are `mapped` lie in the file and take memory only while they are read.
     seconds: spent in `save` so far. earlier_seconds: what attempts before this one spent on the optimization, as far
     as the checkpoint that was loaded goes.
     """
@@ -48,12 +48,12 @@ class WorkFolder:
         self.monitor.checkpointed((target,))
         self.seconds += time.monotonic() - started
 
-    def load(self, name: str) -> dict[str, Any] | None:
+    def load(self, name: str, *, mapped: bool = False) -> dict[str, Any] | None:
         target = self.path / f"{name}.pt"
         if not target.exists():
             return None
         try:
-            content: dict[str, Any] = torch.load(target, map_location="cpu", weights_only=True)
+            content: dict[str, Any] = torch.load(target, map_location="cpu", weights_only=True, mmap=mapped)
         except (OSError, RuntimeError, EOFError, ValueError):
             return None
         return content if content.get("fingerprint") == self.fingerprint else None

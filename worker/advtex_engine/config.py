@@ -129,7 +129,10 @@ class TextureConfig:
     holdout           N leaves out of every stage the sorted frames whose position % N == N // 2
     steps             overrides the preset's step count, its levels scaled in proportion
     face_budget       the mesh is decimated to at most this many faces
+    max_views         of a longer scan, these many frames are chosen; fewer where their maps would not fit into memory
     max_texture_size  cap on the texture's side in texels
+    layout            name of the scan's layout; None takes the one that fits best
+    memory_bytes      what the run may take of a GPU that others use too; None: all that is free
     refine            cameras and exposures are refined first; never for the preset "paper", which stays as published
     """
 
@@ -139,12 +142,15 @@ class TextureConfig:
     holdout: int | None = None
     steps: int | None = None
     face_budget: int = 80_000
+    max_views: int = 240
     max_texture_size: int = 4096
     texels_per_pixel: float = 1.2
     refine: bool = True
     device: str = "auto"
     seed: int = 0
     checkpoint_seconds: float = 30.0
+    layout: str | None = None
+    memory_bytes: int | None = None
 
     @property
     def refines(self) -> bool:
@@ -164,5 +170,7 @@ class TextureConfig:
             raise OptionError(f"steps {self.steps} is out of bounds; at least 1 is needed")
         if self.face_budget < 100:
             raise OptionError(f"face budget {self.face_budget} is out of bounds; at least 100 faces are needed")
+        if self.max_views < 2:
+            raise OptionError(f"max views {self.max_views} is out of bounds; at least 2 are compared with each other")
         if not 256 <= self.max_texture_size <= 16384:
             raise OptionError(f"max texture size {self.max_texture_size} is out of bounds; 256 to 16384 texels fit")

@@ -17,6 +17,7 @@ from advtex_engine.errors import Problem
 from advtex_engine.monitor import Monitor
 from advtex_engine.rasterize import rasterize
 from advtex_engine.scene import Camera, Mesh
+from advtex_scan.manifest import ScanManifest
 
 Raw = npt.NDArray[np.uint16]
 
@@ -50,11 +51,23 @@ class DepthEncoding:
         return np.where(empty | (metres > self.farthest), np.float32(0), metres)
 
 
+PLAIN = (
+    DepthEncoding("millimetres", 1_000.0),
+    DepthEncoding("fifths of a millimetre, as TUM stores it", 5_000.0),
+    DepthEncoding("6553.5 units per metre, as Replica stores it", 6_553.5),
+    DepthEncoding("tenths of a millimetre", 10_000.0),
+)
 ROTATED = (
     DepthEncoding("bit-rotated millimetres", 1_000.0, rotated=True),
     # 16 bits end at 6.55 m here; what stands close to that end is a mark or an overflow, no reading.
     DepthEncoding("bit-rotated tenths of a millimetre", 10_000.0, rotated=True, farthest=6.0),
 )
+
+
+def declared_encoding(manifest: ScanManifest) -> DepthEncoding:
+    """How a scan says that its depth is stored."""
+    name = f"{'bit-rotated, ' if manifest.depth_rotated else ''}{manifest.depth_scale:g} units per metre"
+    return DepthEncoding(name, manifest.depth_scale, manifest.depth_rotated, manifest.depth_farthest)
 
 
 def inflate(data: bytes, width: int, height: int) -> Raw:
@@ -83,7 +96,7 @@ def measure_depth(
     rendered = np.concatenate([depth for _, depth in pairs]) if pairs else np.zeros(0, np.float32)
     if len(stored) < MIN_READINGS:
         return declared
-    shares = {encoding: agreement(encoding, stored, rendered) for encoding in (declared, *ROTATED)}
+    shares = {encoding: agreement(encoding, stored, rendered) for encoding in (declared, *PLAIN, *ROTATED)}
     best = max(shares, key=lambda encoding: shares[encoding])
     if shares[declared] >= FITTING_SHARE:
         return declared
@@ -140,6 +153,31 @@ def depth_in_color_image(depth: Tensor, depth_camera: Camera, color_camera: Came
     if repeat > 1:
         depth = depth.repeat_interleave(repeat, 0).repeat_interleave(repeat, 1)
         depth_camera = scaled_camera(depth_camera, depth_camera.width * repeat, depth_camera.height * repeat)
+    index, z, _ = _landing(depth, depth_camera, color_camera)
+    nearest = torch.full((color_camera.height * color_camera.width,), torch.inf)
+    nearest.scatter_reduce_(0, index, z, "amin")
+    nearest[nearest.isinf()] = 0
+    return nearest.view(color_camera.height, color_camera.width)
+
+
+def outside_mask(depth: Tensor, depth_camera: Camera, mask: Tensor, color_camera: Camera) -> Tensor:
+    """Which readings [h,w] of one camera fall on pixels that another one's mask [H,W] bool leaves out: [h,w] bool.
+
+    Of what falls beside the mask's image it says nothing.
+    """
+    assert depth.shape == (depth_camera.height, depth_camera.width)
+    assert mask.shape == (color_camera.height, color_camera.width)
+    index, _, inside = _landing(depth, depth_camera, color_camera)
+    left_out = torch.zeros_like(inside)
+    left_out[inside] = ~mask.flatten()[index]
+    return left_out
+
+
+def _landing(depth: Tensor, depth_camera: Camera, color_camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+    """Where the N readings of depth [h,w] land that land in another camera's image.
+
+    Flat pixels [N] int64 and depths [N] there, and which readings these are, [h,w] bool.
+    """
     to_color = color_camera.world_to_camera @ torch.linalg.inv(depth_camera.world_to_camera)
     # A reading z at the pixel (u, v) lands at H (u, v, 1) z + h, undivided: two small outer sums per coordinate.
     H = (color_camera.K @ to_color[:3, :3] @ torch.linalg.inv(depth_camera.K)).tolist()
@@ -150,8 +188,4 @@ def depth_in_color_image(depth: Tensor, depth_camera: Camera, color_camera: Came
     column, row = (x / z).floor(), (y / z).floor()
     inside = (depth > 0) & (z > 0) & (column >= 0) & (row >= 0)
     inside &= (column < color_camera.width) & (row < color_camera.height)
-    index = (row[inside] * color_camera.width + column[inside]).long()
-    nearest = torch.full((color_camera.height * color_camera.width,), torch.inf)
-    nearest.scatter_reduce_(0, index, z[inside], "amin")
-    nearest[nearest.isinf()] = 0
-    return nearest.view(color_camera.height, color_camera.width)
+    return (row[inside] * color_camera.width + column[inside]).long(), z[inside], inside

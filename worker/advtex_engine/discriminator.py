@@ -30,21 +30,31 @@ class PatchDiscriminator(nn.Module):
             assert isinstance(layer, nn.Conv2d) and layer.bias is not None
             nn.init.normal_(layer.weight, 0.0, 0.02, generator=generator)
             nn.init.zeros_(layer.bias)
+            # As the images are: so gradients come as Adam needs them.
+            layer.weight.data = layer.weight.data.contiguous(memory_format=torch.channels_last)
 
     def forward(self, condition: Tensor, residual: Tensor) -> Tensor:
         """condition I_A [B,3,H,W] and residual X - I_A [B,3,H,W] -> logits [B,1,H//8-2,W//8-2], one per 70x70 patch."""
-        return self.examine(condition, residual)[0]
-
-    def examine(self, condition: Tensor, residual: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """The logits as from `forward`, and what the four layers before them respond: [B,64|128,h,w] each."""
         assert condition.shape == residual.shape and condition.shape[1] == 3
-        assert min(condition.shape[-2:]) >= MIN_SIZE
-        x = torch.cat((condition, residual), 1).contiguous(memory_format=torch.channels_last)
-        features = []
-        for layer in self.convolutions[:-1]:
-            x = F.leaky_relu(layer(x), 0.2)
+        return self.examine(torch.cat((condition, residual), 1))[0]
+
+    def examine(self, x: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """The logits as from `forward`, and what the four layers before them respond: [B,64|128,h,w] each.
+
+        x: [B,6,H,W], condition and residual; channels beyond them are met by weights of zero.
+        """
+        assert min(x.shape[-2:]) >= MIN_SIZE
+        x = x.contiguous(memory_format=torch.channels_last)
+        first, *middle, last = self.convolutions
+        assert isinstance(first, nn.Conv2d)
+        # Tensor cores want a multiple of 8 channels; the parameters stay those of 6.
+        weight = F.pad(first.weight, (0, 0, 0, 0, 0, x.shape[1] - 6)) if x.shape[1] > 6 else first.weight
+        x = F.leaky_relu(F.conv2d(x, weight, first.bias, first.stride, first.padding), 0.2, inplace=True)
+        features = [x]
+        for layer in middle:
+            x = F.leaky_relu(layer(x), 0.2, inplace=True)
             features.append(x)
-        return self.convolutions[-1](x), features
+        return last(x), features
 
 
 def patch_shares(mask: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 EngineError
 ├── ScanError       the scan cannot be textured; `findings` say what and how to mend it
 ├── OptionError     an option is out of bounds or unknown
+├── MemoryShortage  the device has too little memory, also for the least that can be done
 └── Stopped         a stop was asked for; a checkpoint is on disk
 """
 
@@ -35,6 +36,10 @@ class ScanError(EngineError):
 
 class OptionError(EngineError):
     """An option is out of bounds or unknown."""
+
+
+class MemoryShortage(EngineError):
+    """The device has too little memory, and nothing is left to be made smaller."""
 
 
 class Stopped(EngineError):

@@ -94,6 +94,7 @@ def evaluate(
     *,
     size: tuple[int, int] | None = None,
     holdout: int | None = None,
+    layout: str | None = None,
     reference: Path | None = None,
     weights: Path | None = None,
     sheet: Path | None = None,
@@ -102,14 +103,15 @@ def evaluate(
 ) -> Evaluation:
     """Scores an OBJ or GLB against a scan's held-out frames, or against all frames without `holdout`.
 
-    size: width and height of the renders and photographs in pixels; None keeps the scan's. reference: a mesh file that
+    size: width and height of the renders and photographs in pixels; None keeps the scan's. layout: of the scan; None
+    takes the one that fits best. reference: a mesh file that
     decides which pixels count, by default the scan's mesh; models compared with each other need the same one. weights:
     see `perceptual.weights_folder`; without them `lpips` and `lpips_full` are None. sheet: PNG to write, photograph |
     render | difference. refine_poses: the frames' poses are refined against the model first, to tell a texture that is
     displaced from one that is wrong. Raises ScanError, ModelError, OptionError, and EngineError when no view can be
     scored.
     """
-    scene = _load_views(scan, TextureConfig(size=size, holdout=holdout), monitor or Monitor())
+    scene = _load_views(scan, TextureConfig(size=size, holdout=holdout, layout=layout), monitor or Monitor())
     target = scene.mesh if reference is None else load_reference(reference)
     atlas, texture = load_model(model)
     if model.suffix.lower() == ".glb":
@@ -155,6 +157,8 @@ def compare(atlas: Atlas, texture: Tensor, view: View, reference: Mesh | None = 
     mask = target.face_index >= 0
     if view.depth is not None:
         mask = mask & (view.depth > 0) & ((view.depth - target.depth).abs() < DEPTH_AGREEMENT)
+    if view.mask is not None:
+        mask = mask & view.mask
     if int(mask.sum()) < MIN_PIXELS:
         return None
     covered = mask & (fragments.face_index >= 0) & ((fragments.depth - target.depth).abs() < DEPTH_AGREEMENT)
@@ -204,7 +208,7 @@ def _load_views(scan: Path, config: TextureConfig, monitor: Monitor) -> Scene:
     """The scan with the evaluated frames as its views; the others are not decoded."""
     try:
         with open_scan(scan) as archive:
-            reading = read_scan(archive)
+            reading = read_scan(archive, config.layout)
             errors = [finding for finding in reading.report.findings if finding.severity == "error"]
             if errors or reading.manifest is None:
                 raise ScanError(*map(_problem, errors))

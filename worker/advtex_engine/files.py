@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 import tempfile
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
+
+_masking = threading.Lock()
 
 
 @contextmanager
@@ -39,6 +42,8 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 
 def _umask() -> int:
-    mask = os.umask(0o022)
-    os.umask(mask)
+    # The mask can only be read by setting it, which all threads see: two at once would leave the wrong one behind.
+    with _masking:
+        mask = os.umask(0o022)
+        os.umask(mask)
     return mask

@@ -11,6 +11,7 @@ import math
 import posixpath
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 from urllib.parse import unquote
 
@@ -68,7 +69,7 @@ class _Document:
 
     def polygons(self) -> Polygons:
         positions, faces, uvs = list[Floats](), list[Integers](), list[Floats | None]()
-        count = 0
+        materials, count = list[Integers](), 0
         for mesh, transform in self._instances():
             for primitive in self._document["meshes"][mesh]["primitives"]:
                 if primitive.get("mode", TRIANGLES) not in (TRIANGLES, STRIP, FAN):
@@ -82,6 +83,7 @@ class _Document:
                     raise MeshFormatError(f"has face index {triangles.max()} out of range for {len(position)} vertices")
                 uvs.append(self._accessor(attributes["TEXCOORD_0"], 2) if "TEXCOORD_0" in attributes else None)
                 faces.append(triangles + count)
+                materials.append(np.full(len(triangles), int(primitive.get("material", -1)) + 1))
                 positions.append(position)
                 count += len(position)
                 if sum(map(len, faces)) > MAX_FACES:
@@ -90,10 +92,12 @@ class _Document:
             raise MeshFormatError("has no faces")
         corners = np.concatenate(faces).reshape(-1)
         sizes = np.full(len(corners) // 3, 3)
+        names = ("", *map(str, range(len(self._document.get("materials", [])))))
+        found = Polygons(np.concatenate(positions), corners, sizes, material=np.concatenate(materials), materials=names)
         uv = [each for each in uvs if each is not None]
         if len(uv) < len(uvs) or [len(each) for each in uv] != [len(each) for each in positions]:
-            return Polygons(np.concatenate(positions), corners, sizes)
-        return Polygons(np.concatenate(positions), corners, sizes, np.concatenate(uv), corners)
+            return found
+        return replace(found, uv=np.concatenate(uv), uv_corners=corners)
 
     def _instances(self) -> list[tuple[int, Floats]]:
         """(mesh, mesh-to-world transform) of every mesh node of the default scene, depth first."""

@@ -109,7 +109,8 @@ class Sampler:
     def image(self, view: int) -> Tensor:
         """[1,3,H,W] in [0,1]."""
         size = (self.maps.height, self.maps.width, 3)
-        return self.maps.color[view].view(size).permute(2, 0, 1)[None].to(torch.float32) / 255
+        image = self.maps.color[view].to(self.maps.device).view(size)
+        return image.permute(2, 0, 1)[None].to(torch.float32) / 255
 
     def grid(self, view: int, points: Tensor) -> tuple[Tensor, Tensor]:
         """World points [N,3] -> positions [1,1,N,2] for grid_sample, and depth [N] in metres."""
@@ -125,7 +126,7 @@ class Sampler:
         """[N] whether one of the four pixels around a position shows the surface at about this depth."""
         pixel = (grid[0, 0] + 1) / 2 * grid.new_tensor([self.maps.width, self.maps.height])
         indices, _ = bilinear_footprint(pixel, self.maps.width, self.maps.height)
-        surface = self.maps.depth[view][indices].to(torch.float32)
+        surface = self.maps.depth[view].to(self.maps.device)[indices].to(torch.float32)
         return ((surface > 0) & ((surface - depth[:, None]).abs() < self.tolerance)).any(1)
 
 

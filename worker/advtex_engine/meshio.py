@@ -9,7 +9,7 @@ PLY and OBJ count v from the image's bottom row, scene.py from its top row: v is
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -237,6 +237,8 @@ def read_obj(data: bytes) -> Polygons:
     """Wavefront OBJ: v, vt and f (v, v/vt, v//vn, v/vt/vn, relative indices); uv are kept if every corner has one."""
     position, uv = list[list[float]](), list[list[float]]()
     corners, uv_corners, sizes = list[int](), list[int](), list[int]()
+    material, materials = list[int](), {"": 0}
+    used = 0
     for line in data.decode("latin-1").replace("\\\n", " ").splitlines():
         words = line.split()
         try:
@@ -248,25 +250,26 @@ def read_obj(data: bytes) -> Polygons:
                 uv.append([float(words[1]), float(words[2])])
             elif words[0] == "f":
                 sizes.append(len(words) - 1)
+                material.append(used)
                 for word in words[1:]:
                     parts = word.split("/")
                     corners.append(_obj_index(parts[0], len(position)))
                     if len(parts) > 1 and parts[1]:
                         uv_corners.append(_obj_index(parts[1], len(uv)))
+            elif words[0] == "usemtl":
+                used = materials.setdefault(" ".join(words[1:]), len(materials))
         except (IndexError, ValueError) as error:
             raise MeshFormatError(f"has a line that cannot be read: {line[:80]!r}") from error
     polygons = Polygons(
-        np.array(position).reshape(-1, 3), np.array(corners, dtype=np.int64), np.array(sizes, dtype=np.int64)
+        np.array(position).reshape(-1, 3),
+        np.array(corners, dtype=np.int64),
+        np.array(sizes, dtype=np.int64),
+        material=np.array(material, dtype=np.int64),
+        materials=tuple(materials),
     )
     if not uv_corners or len(uv_corners) != len(corners):
         return polygons
-    return Polygons(
-        polygons.position,
-        polygons.corners,
-        polygons.sizes,
-        flip_v(np.array(uv).reshape(-1, 2)),
-        np.array(uv_corners, dtype=np.int64),
-    )
+    return replace(polygons, uv=flip_v(np.array(uv).reshape(-1, 2)), uv_corners=np.array(uv_corners, dtype=np.int64))
 
 
 def _obj_index(word: str, count: int) -> int:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from advtex_engine.errors import Problem
 
 STAGES = (
     "ingest",
+    "conventions",
+    "fusion",
     "geometry",
     "refinement",
     "atlas",
@@ -21,6 +25,19 @@ STAGES = (
 )
 
 
+@dataclass(frozen=True)
+class Glimpse:
+    """The texture as it is after `step`: small JPEGs of the model by file name, and the curves so far (`curves.py`).
+
+    titles: the view's name for each of the pictures.
+    """
+
+    step: int
+    pictures: Mapping[str, bytes]
+    titles: Mapping[str, str]
+    curves: Mapping[str, Any]
+
+
 class Monitor:
     """Callbacks of a run, all on the run's thread; this base ignores everything and never stops.
 
@@ -30,16 +47,24 @@ class Monitor:
     """
 
     def stage_started(self, stage: str) -> None:
-        """`stage` is one of STAGES."""
+        """`stage` is one of STAGES, in their order; fusion and refinement only come where they are needed."""
 
-    def stage_finished(self, stage: str, seconds: float, peak_memory_bytes: int) -> None:
-        """Host memory (peak resident set of the process so far)."""
+    def stage_finished(
+        self, stage: str, seconds: float, peak_memory_bytes: int, peak_device_memory_bytes: int | None
+    ) -> None:
+        """Peaks of the stage: the process's resident set, and what tensors took on a GPU (None on a CPU)."""
 
     def progress(self, step: int, steps: int, losses: Mapping[str, float]) -> None:
         """Optimiser iterations done, their total, and the newest losses; a few times per second at most."""
 
+    def glimpsed(self, glimpse: Glimpse) -> None:
+        """The texture so far, every few seconds of the optimization."""
+
     def warning(self, problem: Problem) -> None:
         """Something a user should know that does not end the run."""
+
+    def note(self, message: str) -> None:
+        """Something that a user may like to know, and that nothing is wrong with."""
 
     def checkpointed(self, files: tuple[Path, ...]) -> None:
         """Files written since the last call."""

@@ -5,9 +5,12 @@ discriminator judge [I_A, real - I_A] and [I_A, fake - I_A]; update both players
 
 The texture's values are in [0, 1], so that its learning rate is in those units; the networks see colors in [-1, 1].
 Pixels that B does not see carry a zero residual in the real and in the fake example alike, so
-that the discriminator cannot tell them apart by their holes. Nothing in `step` waits for the device: a skipped
-discriminator update is a flag that Adam's kernel reads. On a CPU, where a branch costs nothing, the skipped gradient is
-not computed.
+that the discriminator cannot tell them apart by their holes.
+
+Nothing in a step waits for the device, and nothing that changes from step to step is a number of Python's: what the
+schedule says is read on the device, and a skipped update is a flag that Adam's kernel reads. So a step can be captured
+as a CUDA graph (`graphed.py`). All state keeps its address; loading a checkpoint copies into it. On a CPU, where a
+branch costs nothing, what is skipped is not computed.
 """
 
 from __future__ import annotations
@@ -19,17 +22,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advtex_engine.alignment import BLOCK, block_offsets, search_bound, shift
+from advtex_engine.alignment import BLOCK, block_offsets, search_bound
 from advtex_engine.batches import Batch, PairSampler
 from advtex_engine.config import Preset
 from advtex_engine.discriminator import MIN_SIZE, PatchDiscriminator
+from advtex_engine.examples import InputForm
 from advtex_engine.losses import adversarial_loss, discriminator_loss, feature_loss, l1_loss, patch_masks
-from advtex_engine.texture import sample_texels
+from advtex_engine.operations import Operations, choose_operations
+from advtex_engine.schedule import Schedule
 from advtex_engine.views import Pairs, ViewMaps
 
 CROP_SHARE = 0.1  # the released code shifts its crop by up to 69 of 640 pixels, about a tenth of the width
-AVERAGE_EVERY = 10  # steps between two states that enter the texture's average
-WHOLLY_VISIBLE = 0.99  # a moved pixel that mixes in what is not visible does not count
 LOSS_NAMES = ("discriminator", "adversarial", "l1", "features", "skipped")
 
 
@@ -62,9 +65,10 @@ def crop_size(width: int, height: int, largest: tuple[int, int] | None = None) -
 class AdversarialOptimizer:
     """State and step of one optimization over fixed view maps.
 
-    values: start of the compact texture, [slots,3] float32 in [0,1]. steps: the whole run's length, which the decay of
-    lambda is scaled to; `index` counts the steps over all levels of a pyramid. In the first preset.pretraining of them
+    values: start of the compact texture, [slots,3] float32 in [0,1]. steps: the whole run's length, which the schedule
+    is scaled to; `index` counts the steps over all levels of a pyramid. In the first preset.pretraining of them
     the discriminator learns alone: a start that is sharp already is spoiled by one that knows nothing.
+    operations: the device's own unless given. branches: whether the host may look at the device's values to skip work.
     """
 
     def __init__(
@@ -78,52 +82,61 @@ class AdversarialOptimizer:
         steps: int,
         generator: torch.Generator,
         discriminator: PatchDiscriminator,
+        operations: Operations | None = None,
     ) -> None:
         assert values.shape == (maps.slots, 3)
         device = maps.color.device
         self.maps, self.pairs, self.preset, self.device = maps, pairs, preset, device
-        self.steps, self.index = steps, 0
+        self.schedule = Schedule(preset, steps, device)
+        self.operations = operations or choose_operations(device)
+        self.branches = device.type == "cpu"
         self.generator = generator
         self.values = values.clone().to(device).requires_grad_(True)
         self.start = self.values.detach().clone() if preset.l1_target == "start" else None
         self.average = self.values.detach().clone() if preset.averaging else None
         self.discriminator = discriminator
         self.parameters = list(discriminator.parameters())
-        self.adam_texture = _adam([self.values], preset.lr_texture, preset.beta1)
-        self.adam_discriminator = _adam(self.parameters, preset.lr_discriminator, preset.beta1)
+        self.adam_texture = _adam([self.values], self.schedule.lr_texture, preset.beta1)
+        self.adam_discriminator = _adam(self.parameters, self.schedule.lr_discriminator, preset.beta1)
         self.bfloat16 = native_bfloat16(device)
         self.crop = crop_size(maps.width, maps.height, preset.max_crop)
         self.aligns = preset.alignment and min(self.crop) >= BLOCK
+        on_gpu = device.type == "cuda"
+        dtype = torch.bfloat16 if on_gpu and self.bfloat16 else torch.float32
+        self.form = InputForm(8 if on_gpu else 6, dtype, preset.condition)
         perturbation = preset.perturbation * maps.width
         self.sampler = PairSampler(maps, pairs, kind, self.crop, generator, perturbation)
         self._sums = torch.zeros(len(LOSS_NAMES), device=device)
         self._summed = 0
 
     @property
-    def l1_weight(self) -> float:
-        """lambda: l1_weight times l1_decay for each passed period; the paper's 1,000 of 50,000 steps are one period."""
-        periods = int(self.index * self.preset.l1_decays / self.steps)
-        return self.preset.l1_weight * self.preset.l1_decay**periods
+    def index(self) -> int:
+        """Of the next step, over all levels."""
+        return self.schedule.index
+
+    @index.setter
+    def index(self, index: int) -> None:
+        self.schedule.index = index
 
     @property
     def pretraining(self) -> bool:
         """Whether the texture still waits for the discriminator."""
-        return self.index < self.preset.pretraining
-
-    @property
-    def lr_share(self) -> float:
-        """Of both learning rates at this step: 1 while the discriminator learns alone, then straight to lr_end."""
-        done = max(0.0, (self.index - self.preset.pretraining) / (self.steps - self.preset.pretraining))
-        return 1 - (1 - self.preset.lr_end) * done
+        return self.schedule.pretraining_at(self.index)
 
     def draw(self) -> Batch:
         """A random pair and crop, with the auxiliary view warped into the source."""
-        return self.sampler.draw()
+        return self.operations.draw(self.sampler)
 
     def step(self) -> None:
         """Draws a pair, updates the texture, and the discriminator unless it is ahead (its loss <= the texture's)."""
+        self.device_step()
+        self.count(1)
+
+    def device_step(self) -> None:
+        """The device's part of `step`, which may be captured once and replayed; whoever does so calls `count`."""
+        self.schedule.read()
         losses = self.play(self.draw())
-        if self.pretraining:
+        if self.branches and self.pretraining:
             self.update_discriminator(losses)
         else:
             gradient = self.texture_gradient(losses)
@@ -132,53 +145,54 @@ class AdversarialOptimizer:
             self._take_average()
         named = (losses.discriminator, losses.adversarial, losses.l1, losses.features, losses.ahead)
         self._sums += torch.stack(named).detach()
-        self._summed += 1
-        self.index += 1
+
+    def count(self, steps: int) -> None:
+        """Tells the host of steps that the device was given."""
+        self.schedule.count(steps)
+        self._summed += steps
 
     def play(self, batch: Batch) -> Losses:
         """Renders the fake example and lets the discriminator judge both; one fake forward pass serves both players."""
         fake = self._render(self.values, batch)
-        real, aligned, visible = self._align(batch, fake) if self.aligns else (batch.real, fake, batch.visible)
-        masks = patch_masks(batch.foreground, visible)
-        # Without the condition the network sees the example itself beside three empty channels.
-        condition = batch.condition if self.preset.condition else torch.zeros_like(batch.condition)
+        offsets = self._offsets(batch, fake) if self.aligns else None
+        shown = self.operations.assemble(batch.condition, batch.real, fake, batch.visible, offsets, self.form)
+        masks = patch_masks(batch.foreground, shown.visible)
         with self._autocast():
-            fake_logits, of_fake = self.discriminator.examine(condition, (aligned - condition) * visible)
-            real_logits, of_real = self.discriminator.examine(condition, (real - condition) * visible)
+            fake_logits, of_fake = self.discriminator.examine(shown.fake_input)
+            real_logits, of_real = self.discriminator.examine(shown.real_input)
             fake_logits, real_logits = fake_logits.float(), real_logits.float()
         of_discriminator = discriminator_loss(real_logits, fake_logits, masks.discriminator)
         adversarial = adversarial_loss(fake_logits, masks.texture)
-        ahead = (of_discriminator <= adversarial).to(torch.float32).detach()
-        if self.pretraining:
-            ahead = torch.zeros_like(ahead)
+        ahead = (of_discriminator <= adversarial).to(torch.float32).detach() * (1 - self.schedule.pretraining)
         if self.start is None:
-            l1 = l1_loss(aligned, real, visible)
+            l1 = l1_loss(shown.fake, shown.real, shown.visible)
         else:
             l1 = l1_loss(fake, self._render(self.start, batch), batch.visible)
-        features = feature_loss(of_fake, of_real) if self.preset.feature_weight else torch.zeros_like(l1)
+        features = torch.zeros_like(l1)
+        if self.preset.feature_weight:
+            features = feature_loss(of_fake, of_real, self.operations.mean_difference)
         return Losses(of_discriminator, adversarial, l1, features, ahead)
 
-    def _align(self, batch: Batch, fake: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The real and the fake example moved onto the source, and where both are still visible."""
+    def _offsets(self, batch: Batch, fake: Tensor) -> Tensor:
+        """Offsets [2,gh,gw,2] that move the real and the fake example onto the source."""
         examples = torch.cat((batch.real, fake.detach()))
-        offsets = block_offsets(batch.condition, examples, batch.visible, search_bound(self.maps.width))
-        visible = shift(batch.visible.expand(2, -1, -1, -1), offsets).amin(0, keepdim=True) > WHOLLY_VISIBLE
-        return shift(batch.real, offsets[:1]), shift(fake, offsets[1:]), batch.visible * visible
+        return block_offsets(batch.condition, examples, batch.visible, search_bound(self.maps.width))
 
     def _render(self, values: Tensor, batch: Batch) -> Tensor:
         """The compact texture seen by the source view, [1,3,h,w] in [-1,1]."""
-        return self.sampler.image(sample_texels(values, batch.slots, batch.weights)) * 2 - 1
+        return self.sampler.image(self.operations.sample_texels(values, batch.slots, batch.weights)) * 2 - 1
 
     def texture_gradient(self, losses: Losses) -> Tensor:
         """Gradient [slots,3] of the texture's loss; keeps the graph, which the discriminator's gradient needs too."""
-        loss = losses.adversarial + self.l1_weight * losses.l1 + self.preset.feature_weight * losses.features
+        loss = losses.adversarial + self.schedule.l1_weight * losses.l1 + self.preset.feature_weight * losses.features
         (gradient,) = torch.autograd.grad(loss, [self.values], retain_graph=True)
         return gradient
 
     def update_texture(self, gradient: Tensor) -> None:
-        """One step of Adam over the compact texture."""
+        """One step of Adam over the compact texture, unless it waits for the discriminator."""
         self.values.grad = gradient
-        self.adam_texture.param_groups[0]["lr"] = self.preset.lr_texture * self.lr_share
+        if not self.branches:
+            self.adam_texture.found_inf = self.schedule.pretraining  # type: ignore[attr-defined]
         self.adam_texture.step()
 
     @property
@@ -188,22 +202,21 @@ class AdversarialOptimizer:
 
     def _take_average(self) -> None:
         """The mean of the states so far, then a moving one over `averaging` steps."""
-        taken, rest = divmod(self.index - self.preset.pretraining, AVERAGE_EVERY)
-        if self.average is not None and rest == 0:
-            window = max(1, self.preset.averaging // AVERAGE_EVERY)
-            self.average.lerp_(self.values.detach(), 1 / min(taken + 1, window))
+        if self.average is None or (self.branches and not self.schedule.average_weight_at(self.index)):
+            return
+        self.operations.average(self.average, self.values.detach(), self.schedule.average_weight)
 
     def update_discriminator(self, losses: Losses) -> None:
         """One step of Adam over the discriminator, unless it is ahead."""
-        if self.device.type == "cpu" and bool(losses.ahead):
+        if self.branches and bool(losses.ahead):
             return
         gradients = torch.autograd.grad(losses.discriminator, self.parameters)
         for parameter, gradient in zip(self.parameters, gradients, strict=True):
-            # The fused CPU kernel ignores strides: a channels_last gradient would be taken for a contiguous one.
-            parameter.grad = gradient.contiguous()
-        if self.device.type != "cpu":
+            # The fused kernels ignore strides, or refuse those that differ.
+            same = gradient.stride() == parameter.stride()
+            parameter.grad = gradient if same else torch.empty_like(parameter).copy_(gradient)
+        if not self.branches:
             self.adam_discriminator.found_inf = losses.ahead  # type: ignore[attr-defined]  # the fused kernel's skip flag
-        self.adam_discriminator.param_groups[0]["lr"] = self.preset.lr_discriminator * self.lr_share
         self.adam_discriminator.step()
 
     def drain_losses(self) -> dict[str, float]:
@@ -216,7 +229,7 @@ class AdversarialOptimizer:
         return dict(zip(LOSS_NAMES, means, strict=True))
 
     def state_dict(self) -> dict[str, Any]:
-        """All that decides the remaining steps; tensors on the CPU."""
+        """All that decides the remaining steps."""
         state: dict[str, Any] = {
             "index": self.index,
             "values": self.values.detach(),
@@ -231,19 +244,19 @@ class AdversarialOptimizer:
             state["average"] = self.average
         return state
 
+    @torch.no_grad()
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues from `state_dict` of an optimizer over the same view maps."""
+        """Continues from `state_dict` of an optimizer over the same view maps; every tensor keeps its address."""
         assert state["values"].shape == self.values.shape
         self.index = int(state["index"])
-        with torch.no_grad():
-            self.values.copy_(state["values"])
-            if self.start is not None:
-                self.start.copy_(state["start"])
-            if self.average is not None:
-                self.average.copy_(state["average"])
+        self.values.copy_(state["values"])
+        if self.start is not None:
+            self.start.copy_(state["start"])
+        if self.average is not None:
+            self.average.copy_(state["average"])
         self.discriminator.load_state_dict(state["discriminator"])
-        self.adam_texture.load_state_dict(state["adam_texture"])
-        self.adam_discriminator.load_state_dict(state["adam_discriminator"])
+        _load_adam(self.adam_texture, state["adam_texture"])
+        _load_adam(self.adam_discriminator, state["adam_discriminator"])
         self.generator.set_state(state["generator"])
 
     def _autocast(self) -> contextlib.AbstractContextManager[Any]:
@@ -252,6 +265,22 @@ class AdversarialOptimizer:
         return torch.autocast(self.device.type, dtype=torch.bfloat16)
 
 
-def _adam(parameters: list[Any], lr: float, beta1: float) -> torch.optim.Adam:
-    on_gpu = parameters[0].device.type == "cuda"
-    return torch.optim.Adam(parameters, lr=lr, betas=(beta1, 0.999), fused=True, capturable=on_gpu)
+def _adam(parameters: list[Any], lr: Tensor, beta1: float) -> torch.optim.Adam:
+    """lr: 0-dim, read anew at each step."""
+    capturable = parameters[0].device.type == "cuda"
+    adam = torch.optim.Adam(parameters, lr=lr, betas=(beta1, 0.999), fused=True, capturable=capturable)
+    for parameter in parameters:
+        # As the first step would: what exists before it can be loaded in place.
+        adam.state[parameter] = {
+            "step": torch.zeros((), device=parameter.device),
+            "exp_avg": torch.zeros_like(parameter),
+            "exp_avg_sq": torch.zeros_like(parameter),
+        }
+    return adam
+
+
+def _load_adam(adam: torch.optim.Adam, saved: dict[str, Any]) -> None:
+    (group,) = adam.param_groups
+    for number, parameter in enumerate(group["params"]):
+        for name, tensor in adam.state[parameter].items():
+            tensor.copy_(saved["state"][number][name])

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import platformdirs
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -200,6 +199,8 @@ def weights_folder(folder: Path | None = None) -> Path:
     """Where weights are read from: `folder`, else $ADVTEX_LPIPS_WEIGHTS, else the cache that downloads go to."""
     if folder is not None:
         return folder
+    import platformdirs  # here, so that the bench runs where nothing but torch is installed
+
     configured = os.environ.get(WEIGHTS_VARIABLE)
     return Path(configured) if configured else platformdirs.user_cache_path("advtex") / "weights"
 

@@ -1,7 +1,7 @@
 """The stages, in reading order: from a scan's files to a textured model.
 
-ingest -> geometry -> refinement -> atlas -> view maps -> initial texture -> optimization -> dilation -> export
--> previews
+ingest -> conventions -> fusion (of scans without a mesh) -> geometry -> refinement -> atlas -> view maps
+-> initial texture -> optimization -> dilation -> export -> previews
 """
 
 from __future__ import annotations
@@ -17,19 +17,31 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advtex_engine.atlas import build_atlas
+from advtex_engine.atlas import begin_charts, build_atlas
 from advtex_engine.cameras import scaled_camera
+from advtex_engine.capture import FrameStore
+from advtex_engine.chart_cache import ChartMaker, charts_folder
 from advtex_engine.checkpoint import WorkFolder
 from advtex_engine.config import PRESETS, Preset, PyramidLevel, TextureConfig
-from advtex_engine.errors import OptionError
+from advtex_engine.curves import curves
+from advtex_engine.deep_check import judge
+from advtex_engine.devices import choose_device as choose_device
+from advtex_engine.errors import MemoryShortage, OptionError
 from advtex_engine.export import export_model
+from advtex_engine.fusion import fuse
+from advtex_engine.gallery import write_gallery
 from advtex_engine.geometry import clean, decimate
-from advtex_engine.ingest import ingest, opened
+from advtex_engine.ingest import opened, read_capture
+from advtex_engine.limits import Budget
+from advtex_engine.live import Live
+from advtex_engine.memory import Workload, held_bytes, memory_problem
 from advtex_engine.methods import METHODS, MethodInput, require
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.view_selection import select_views
 from advtex_engine.monitor import Monitor
+from advtex_engine.optimize import native_bfloat16
 from advtex_engine.refine import apply_refinement, refine_cameras, refinement_from_dict, refinement_to_dict
+from advtex_engine.registration import MAX_FRAMES, register_mesh
 from advtex_engine.report import (
     Stages,
     WarningKeeper,
@@ -38,12 +50,16 @@ from advtex_engine.report import (
     scene_from_dict,
     scene_to_dict,
     versions,
-    write_previews,
     write_report,
 )
+from advtex_engine.result_page import write_page
 from advtex_engine.scene import Atlas, Mesh, Scene, View
+from advtex_engine.streaming import host_allocator, keep_off
 from advtex_engine.texture import fill_holes
 from advtex_engine.views import ViewMaps, build_view_maps
+
+BORDERS = 1.25  # texels that views touch, of those that the charts cover
+NO_RESULT = ("device", "checkpoint_seconds", "memory_bytes")  # options that the result does not depend on
 
 
 @dataclass(frozen=True)
@@ -57,68 +73,88 @@ class RunResult:
 def texture_scan(
     scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool = False, monitor: Monitor | None = None
 ) -> RunResult:
-    """Textures a scan: model.obj, model.mtl, model.png, model.glb, report.json and previews/ below `out`.
+    """Textures a scan: model.obj, model.mtl, model.png, model.glb, report.json, previews/ and index.html below `out`.
 
     work: folder for stage caches and checkpoints. With `resume`, what it holds of the same scan and options is used;
-    without, it is cleared. Raises ScanError, OptionError, WeightsError for a method without its weights, and Stopped
-    once the monitor asks for a stop.
+    without, it is cleared. Where memory runs out, the run begins again from its caches with less to hold
+    (`limits.py`). Raises ScanError, OptionError, WeightsError for a method without its weights, MemoryShortage once
+    nothing is left to be made smaller, and Stopped once the monitor asks for a stop.
     """
     device = choose_device(config.device)
-    preset = resolve_preset(config, device)
     require(config.method)
-    monitor = WarningKeeper(monitor or Monitor())
-    folder = WorkFolder(work, fingerprint(scan, config), monitor)
+    keeper = WarningKeeper(monitor or Monitor())
+    folder = WorkFolder(work, fingerprint(scan, config), keeper)
     if not resume:
         folder.clear()
     out.mkdir(parents=True, exist_ok=True)
-    stages = Stages(monitor, folder, device)
+    budget = Budget(device, config, folder, keeper)
+    while True:
+        try:
+            return _run(scan, out, budget)
+        except Exception as error:
+            problem = memory_problem(error)
+            if problem is None:
+                raise
+        # Not in the handler: the error's traceback holds what the run had in memory.
+        budget.shrink(keeper.stage, problem)
 
-    scene = _load_scene(scan, config, folder, stages, monitor)
-    scene, refinement = _refine(scene, config, folder, stages, device)
-    atlas = _load_atlas(scene, config, folder, stages, monitor)
+
+def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
+    """The stages within the limits that the budget has now."""
+    config, device, folder, monitor = budget.config, budget.device, budget.folder, budget.monitor
+    stages = Stages(monitor, folder, device)
+    with ChartMaker(charts_folder()) as charts:
+        scene, made = _load_scene(scan, config, folder, stages, budget.early_device, charts)
+        scene, refinement = _refine(scene, config, folder, stages, budget.early_device)
+        atlas, work = _fitting_atlas(scene, budget, stages, charts)
+    folder = budget.texture_folder()
     atlas = replace(atlas, mesh=_mesh_to(atlas.mesh, device))
-    maps = _view_maps(scene, atlas, preset, folder, stages, device)
+    on_host = budget.limits.on_device is not None
+    maps = _view_maps(scene, atlas, work.preset, folder, stages, device, on_host=on_host)
+    work = replace(work, slots=maps[1].slots)
+    budget.fit(work, "view_maps", held_bytes(maps.values(), device), known=True)
+    if budget.limits.on_device is not None and not on_host:
+        maps = {scale: keep_off(level, device, folder.path) for scale, level in maps.items()}
+    preset = budget.preset(work.preset)
     with stages.run("initial_texture"):
         means = {scale: mean_texture(level) for scale, level in maps.items()}
-        given = MethodInput(scene, atlas, maps, means, preset, config, monitor, folder)
+        live = Live(scene, atlas, monitor)
+        given = MethodInput(scene, atlas, maps, means, preset, config, monitor, folder, live)
+        given = replace(given, on_device=budget.limits.on_device)
         if preset.start == "selection" and config.method.startswith("adversarial"):
             given = replace(given, start=_selected_start(given))
     stages.save()
+    held = held_bytes(maps.values(), device) + sum(mean.nbytes for mean in means.values())
+    held += 0 if given.start is None else given.start.nbytes
+    budget.begin()
     with stages.run("optimization"):
         texture, losses = METHODS[config.method](given)
+        budget.folder.earlier_seconds = folder.earlier_seconds
+    memory = budget.report(work, stages.records[-1], held)
     with stages.run("dilation"):
-        texture = fill_holes(texture, maps[1].slot_map >= 0).cpu()
-        mean = means[1].cpu()
-    atlas = replace(atlas, mesh=_mesh_to(atlas.mesh, torch.device("cpu")))
+        texture = fill_holes(texture, maps[1].slot_map >= 0)
     with stages.run("export"):
         files = export_model(out, atlas, texture, up_axis=scene.up_axis)
     with stages.run("previews"):
-        files += write_previews(out, scene, atlas, texture, mean)
-        scores = heldout_scores(scene, atlas, texture, mean)
+        files += write_gallery(out, scene, atlas, texture, means[1], curves(losses, live.quality))
+        atlas = replace(atlas, mesh=_mesh_to(atlas.mesh, torch.device("cpu")))
+        scores = heldout_scores(scene, atlas, texture.cpu(), means[1].cpu())
     parts = {
         "scan": describe_scene(scene),
+        **made,
         "refinement": refinement,
-        "atlas": {key: getattr(atlas, key) for key in ("width", "height", "source", "charts")},
+        "atlas": {key: getattr(atlas, key) for key in ("width", "height", "source", "charts", "pages")},
         "touched_texels": maps[1].slots,
         "stages": stages.records,
-        "saving_seconds": round(folder.seconds, 3),
+        "saving_seconds": round(folder.seconds + (0 if folder is budget.folder else budget.folder.seconds), 3),
+        "step": given.facts.get("step"),
+        "memory": memory,
         "losses": losses,
         "heldout": scores,
     }
     report = _report(monitor, config, preset, device, parts)
-    return RunResult((*files, write_report(out, report)), report)
-
-
-def choose_device(name: str) -> torch.device:
-    """ "auto" is the GPU when there is one. Raises OptionError for a device that is not there."""
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise OptionError(f"device {name!r} is not available here ({error}); use auto, cpu or cuda") from error
-    return device
+    files += (write_report(out, report),)
+    return RunResult((*files, write_page(out, report, files)), report)
 
 
 def resolve_preset(config: TextureConfig, device: torch.device) -> Preset:
@@ -143,23 +179,51 @@ def fingerprint(scan: Path, config: TextureConfig) -> str:
     """
     with opened(scan) as archive:
         files = archive.stamps()
-    options = {key: value for key, value in asdict(config).items() if key not in ("device", "checkpoint_seconds")}
+    options = {key: value for key, value in asdict(config).items() if key not in NO_RESULT}
     content = {"files": files, "options": options}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def _load_scene(scan: Path, config: TextureConfig, folder: WorkFolder, stages: Stages, monitor: Monitor) -> Scene:
+def _load_scene(
+    scan: Path, config: TextureConfig, folder: WorkFolder, stages: Stages, device: torch.device, charts: ChartMaker
+) -> tuple[Scene, dict[str, Any]]:
+    """The scene, mesh and views within their budgets, and the report's parts about how it was made."""
     saved = folder.load("scene")
     if saved is not None:
-        stages.restore("ingest", "geometry")
-        return scene_from_dict(saved)
-    with stages.run("ingest"):
-        scene = ingest(scan, config, monitor)
-    with stages.run("geometry"):
-        scene = replace(scene, mesh=decimate(clean(scene.mesh), config.face_budget, monitor))
-    folder.save("scene", scene_to_dict(scene))
+        stages.restore("ingest", "conventions", "fusion", "geometry")
+        return scene_from_dict(saved), saved["made"]
+    with FrameStore(folder.path) as store:
+        scene, made = _make_scene(scan, config, store, stages, device, charts)
+    folder.save("scene", {**scene_to_dict(scene), "made": made})
     stages.save()
-    return scene
+    return scene, made
+
+
+def _make_scene(
+    scan: Path, config: TextureConfig, store: FrameStore, stages: Stages, device: torch.device, charts: ChartMaker
+) -> tuple[Scene, dict[str, Any]]:
+    monitor = stages.monitor
+    made: dict[str, Any] = {"conventions": None, "fusion": None, "registration": None}
+    with stages.run("ingest"):
+        capture = read_capture(scan, config, store, monitor)
+    with stages.run("conventions"):
+        made["conventions"] = judge(scan, capture.manifest, capture.mesh, monitor)
+    mesh = capture.mesh
+    if mesh is None:
+        with stages.run("fusion"):
+            mesh, made["fusion"] = fuse(capture.measured(), device, monitor)
+    with stages.run("geometry"):
+        mesh = decimate(clean(mesh), config.face_budget, monitor)
+        if capture.mesh_refinement == "none":
+            begin_charts(mesh, charts)  # they are made while views are chosen and cameras refined
+        capture, made["view_choice"] = capture.choose(mesh, config.max_views, monitor)
+        scene = capture.scene(mesh, monitor)
+        if capture.mesh_refinement != "none" and (frames := capture.measured(MAX_FRAMES)):
+            with_scale = capture.mesh_refinement == "scaled"
+            mesh, made["registration"] = register_mesh(scene.mesh, frames, with_scale=with_scale)
+            scene = replace(scene, mesh=mesh)
+        begin_charts(scene.mesh, charts)
+    return scene, made
 
 
 def _refine(
@@ -184,14 +248,47 @@ def _refine(
     return refined, refinement.report
 
 
-def _load_atlas(scene: Scene, config: TextureConfig, folder: WorkFolder, stages: Stages, monitor: Monitor) -> Atlas:
+def _fitting_atlas(scene: Scene, budget: Budget, stages: Stages, charts: ChartMaker) -> tuple[Atlas, Workload]:
+    """The atlas of the largest texture that fits into memory, and what is to be done with it.
+
+    How many texels the views will touch is guessed: what the charts cover, and a margin for their borders.
+    """
+    monitor, device = budget.monitor, budget.device
+    preset = resolve_preset(budget.config, device)
+    while True:
+        try:
+            atlas = _load_atlas(scene, budget.texture_config(), budget.texture_folder(), stages, monitor, charts)
+        except OptionError as error:
+            if budget.limits.texture is None:
+                raise
+            raise MemoryShortage(f"a texture that fits into memory does not hold the charts: {error}") from error
+        camera, size = scene.views[0].camera, (atlas.width, atlas.height)
+        slots = min(1.0, BORDERS * uv_area(atlas.mesh)) * atlas.width * atlas.height
+        work = Workload(
+            len(scene.views),
+            camera.width,
+            camera.height,
+            size,
+            int(slots),
+            budget.config.method,
+            preset,
+            device.type,
+            native_bfloat16(device),
+        )
+        if not budget.fit(work, "atlas"):
+            return atlas, work
+
+
+def _load_atlas(
+    scene: Scene, config: TextureConfig, folder: WorkFolder, stages: Stages, monitor: Monitor, charts: ChartMaker
+) -> Atlas:
     saved = folder.load("atlas")
     if saved is not None:
         stages.restore("atlas")
         mesh = Mesh(scene.mesh.v_pos, saved["t_pos_idx"], saved["v_uv"], saved["t_uv_idx"])
-        return Atlas(mesh, saved["width"], saved["height"], saved["source"], saved["charts"])
+        return Atlas(mesh, saved["width"], saved["height"], saved["source"], saved["charts"], saved["pages"])
     with stages.run("atlas"):
-        atlas = build_atlas(scene.mesh, [view.camera for view in scene.views], config, monitor)
+        atlas = build_atlas(scene.mesh, [view.camera for view in scene.views], config, monitor, charts)
     folder.save(
         "atlas",
         {
@@ -202,6 +299,7 @@ def _load_atlas(scene: Scene, config: TextureConfig, folder: WorkFolder, stages:
             "height": atlas.height,
             "source": atlas.source,
             "charts": atlas.charts,
+            "pages": atlas.pages,
         },
     )
     stages.save()
@@ -209,18 +307,36 @@ def _load_atlas(scene: Scene, config: TextureConfig, folder: WorkFolder, stages:
 
 
 def _view_maps(
-    scene: Scene, atlas: Atlas, preset: Preset, folder: WorkFolder, stages: Stages, device: torch.device
+    scene: Scene,
+    atlas: Atlas,
+    preset: Preset,
+    folder: WorkFolder,
+    stages: Stages,
+    device: torch.device,
+    *,
+    on_host: bool,
 ) -> dict[int, ViewMaps]:
-    """View maps for every scale of the preset, and for the full size, which mean textures and export need."""
+    """View maps for every scale of the preset, and for the full size, which mean textures and export need.
+
+    on_host: their pixels are kept off the device.
+    """
     maps: dict[int, ViewMaps] = {}
+    allocate = host_allocator(device, folder.path) if on_host else None
     with stages.run("view_maps"):
         for scale in sorted({1, *(level.scale for level in preset.levels)}):
-            saved = folder.load(f"view_maps_{scale}")
+            saved = folder.load(f"view_maps_{scale}", mapped=on_host)
             if saved is not None:
-                maps[scale] = ViewMaps(**{key: saved[key] for key in ViewMaps.__dataclass_fields__}).to(device)
+                level = ViewMaps(**{key: saved[key] for key in ViewMaps.__dataclass_fields__})
+                if not on_host:
+                    level = level.to(device)
+                elif device.type != "cpu":
+                    level = keep_off(level, device, folder.path)
+                maps[scale] = level
                 continue
             small = replace(atlas, width=atlas.width // scale, height=atlas.height // scale)
-            maps[scale] = build_view_maps(small, tuple(shrink(view, scale) for view in scene.views), scene.kind)
+            maps[scale] = build_view_maps(
+                small, tuple(shrink(view, scale) for view in scene.views), scene.kind, allocate
+            )
             folder.save(f"view_maps_{scale}", vars(maps[scale]))
     stages.save()
     return maps
@@ -238,7 +354,10 @@ def _selected_start(given: MethodInput) -> Tensor:
 
 
 def shrink(view: View, scale: int) -> View:
-    """The view at 1/scale of its size: color averaged over blocks, depth taken from one pixel of each block."""
+    """The view at 1/scale of its size: color averaged over blocks, depth taken from one pixel of each block.
+
+    A mask lets a block be used if it does all of its pixels.
+    """
     if scale == 1:
         return view
     width, height = view.camera.width // scale, view.camera.height // scale
@@ -247,8 +366,18 @@ def shrink(view: View, scale: int) -> View:
     depth = None
     if view.depth is not None:
         depth = view.depth[scale // 2 : height * scale : scale, scale // 2 : width * scale : scale].contiguous()
-    camera = scaled_camera(view.camera, width, height)
-    return View(view.name, camera, color, depth)
+    mask = None
+    if view.mask is not None:
+        mask = view.mask[: height * scale, : width * scale].reshape(height, scale, width, scale).all(3).all(1)
+    return View(view.name, scaled_camera(view.camera, width, height), color, depth, mask)
+
+
+def uv_area(mesh: Mesh) -> float:
+    """Share of the texture that the faces cover, each counted for itself."""
+    assert mesh.v_uv is not None and mesh.t_uv_idx is not None
+    corners = mesh.v_uv[mesh.t_uv_idx].double()
+    one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return float((one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]).abs().sum() / 2)
 
 
 def _mesh_to(mesh: Mesh, device: torch.device) -> Mesh:

@@ -29,6 +29,7 @@ class Polygons:
     sizes      [F] corners per face
     uv         [U,2] in scene.py's convention, or None
     uv_corners [C] indices into uv, or None
+    material   [F] indices into materials, the names that the file gives them ("" for none); None where it has none
     """
 
     position: Floats
@@ -36,6 +37,8 @@ class Polygons:
     sizes: Integers
     uv: Floats | None = None
     uv_corners: Integers | None = None
+    material: Integers | None = None
+    materials: tuple[str, ...] = ()
 
 
 def triangulate(polygons: Polygons) -> Mesh:

@@ -1,27 +1,35 @@
-"""Pictures for people: what the textured model looks like beside the photographs."""
+"""Pictures for people: what the textured model looks like beside the photographs.
+
+OpenCV is imported where a picture is drawn or encoded: rendering needs torch alone, and so do those who only render.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
-import cv2
 import numpy as np
 import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
 from advtex_engine.cameras import scaled_camera
 from advtex_engine.files import write_atomically
-from advtex_engine.rasterize import rasterize
+from advtex_engine.rasterize import rasterize_views
 from advtex_engine.scene import Atlas, Camera, View
 from advtex_engine.texture import sample_image
 
 BACKGROUND = 0.8
 """Gray level of pixels that show no surface."""
+JPEG_QUALITY = 90
 CAPTION_HEIGHT = 20
 GUTTER = 4
 PAPER, INK = 250, 40
+
+T = TypeVar("T")
 
 
 def render_view(
@@ -32,28 +40,75 @@ def render_view(
     texture: [atlas.height,atlas.width,3] uint8 sRGB or float in [0,1]; sampled bilinearly at supersample x supersample
     points per pixel, whose sRGB values are averaged.
     """
-    color, coverage = render_layers(atlas, texture, camera, supersample=supersample)
-    return color + background * (1 - coverage[..., None])
+    assert texture.shape == (atlas.height, atlas.width, 3)
+    return paint(look(atlas, camera, supersample), texture, background)
 
 
 def render_layers(atlas: Atlas, texture: Tensor, camera: Camera, *, supersample: int = 2) -> tuple[Tensor, Tensor]:
     """Color [H,W,3] times coverage, and coverage [H,W], both float32 in [0,1]: what `render_view` puts together."""
     assert texture.shape == (atlas.height, atlas.width, 3)
+    return _layers(look(atlas, camera, supersample), texture)
+
+
+@dataclass(frozen=True)
+class Sight:
+    """Where a camera's samples meet the model; renders of several textures share it.
+
+    hit: [P] int64, which of the H * s x W * s samples do, in the order of rows. uv: [P,2] float32, where they do.
+    width, height: of the picture. supersample: s.
+    """
+
+    hit: Tensor
+    uv: Tensor
+    width: int
+    height: int
+    supersample: int
+
+    @property
+    def coverage(self) -> float:
+        """Share of the picture that shows the model."""
+        return len(self.hit) / (self.width * self.height * self.supersample**2)
+
+
+def look(atlas: Atlas, camera: Camera, supersample: int = 2) -> Sight:
+    """What `camera` sees of the model at supersample x supersample points per pixel."""
+    return next(look_around(atlas, [camera], supersample))
+
+
+def look_around(atlas: Atlas, cameras: Sequence[Camera], supersample: int = 2) -> Iterator[Sight]:
+    """`look` for each camera in turn; the same result, with the work on the mesh done once."""
     assert supersample >= 1
     mesh = atlas.mesh
     assert mesh.v_uv is not None
     assert mesh.t_uv_idx is not None
-    texels = texture.to(torch.float32) / (255 if texture.dtype == torch.uint8 else 1)
-    width, height = camera.width * supersample, camera.height * supersample
-    fragments = rasterize(mesh, scaled_camera(camera, width, height))
-    hit = fragments.face_index >= 0
-    corners = mesh.v_uv[mesh.t_uv_idx[fragments.face_index[hit].long()]]
-    uv = (fragments.barycentric[hit][:, :, None] * corners).sum(1)
-    color = torch.zeros((height, width, 3), dtype=torch.float32, device=texels.device)
-    color[hit] = sample_image(texels, uv * uv.new_tensor([atlas.width, atlas.height]))
-    layers = torch.cat((color, hit[..., None].to(color)), dim=2)
-    blocks = layers.view(camera.height, supersample, camera.width, supersample, 4).mean(dim=(1, 3))
-    return blocks[..., :3], blocks[..., 3]
+    fine = [scaled_camera(camera, camera.width * supersample, camera.height * supersample) for camera in cameras]
+    for camera, fragments in zip(cameras, rasterize_views(mesh, fine), strict=True):
+        faces = fragments.face_index.flatten()
+        hit = (faces >= 0).nonzero()[:, 0]
+        corners = mesh.t_uv_idx.index_select(0, faces.index_select(0, hit))
+        weights = fragments.barycentric.view(-1, 3).index_select(0, hit)
+        # The mean of three corners weighted by the barycentrics.
+        uv = F.embedding_bag(corners, mesh.v_uv, per_sample_weights=weights, mode="sum")
+        yield Sight(hit, uv, camera.width, camera.height, supersample)
+
+
+def paint(sight: Sight, texture: Tensor, background: float = BACKGROUND) -> Tensor:
+    """The picture [H,W,3] of `render_view`; the texture [h,w,3] may have any size."""
+    color, coverage = _layers(sight, texture)
+    return color + background * (1 - coverage[..., None])
+
+
+def _layers(sight: Sight, texture: Tensor) -> tuple[Tensor, Tensor]:
+    texels = texture.to(torch.float32)
+    height, width, _ = texels.shape
+    sampled = sample_image(texels, sight.uv * sight.uv.new_tensor([width, height]))
+    if texture.dtype == torch.uint8:
+        sampled /= 255
+    fine = (sight.height * sight.supersample, sight.width * sight.supersample)
+    layers = sampled.new_zeros((fine[0] * fine[1], 4))
+    layers.index_copy_(0, sight.hit, F.pad(sampled, (0, 1), value=1.0))
+    pooled = F.avg_pool2d(layers.view(1, *fine, 4).permute(0, 3, 1, 2), sight.supersample)[0].permute(1, 2, 0)
+    return pooled[..., :3], pooled[..., 3]
 
 
 def side_by_side(view: View, rendered: Tensor, mean: Tensor, path: Path) -> None:
@@ -79,17 +134,19 @@ def contact_sheet(views: Sequence[View], rows: Sequence[Sequence[Tensor]], capti
     _write_png(path, np.concatenate(padded))
 
 
-def evenly_spread(views: Sequence[View], count: int) -> tuple[View, ...]:
-    """At most `count` of the views, from all over the capture."""
+def evenly_spread(views: Sequence[T], count: int) -> tuple[T, ...]:
+    """At most `count` of the views or frames, from all over the capture."""
     positions = np.linspace(0, len(views) - 1, min(count, len(views)))
     return tuple(views[round(position)] for position in positions)
 
 
 def _row(pictures: Sequence[Tensor], captions: Sequence[str], name: str) -> NDArray[np.uint8]:
     """Pictures side by side under their captions, [H,W,3] uint8."""
+    import cv2
+
     cells = []
     for index, (picture, caption) in enumerate(zip(pictures, captions, strict=True)):
-        image = (picture.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+        image = to_bytes(picture)
         cell = np.full((image.shape[0] + CAPTION_HEIGHT, image.shape[1], 3), PAPER, np.uint8)
         cell[CAPTION_HEIGHT:] = image
         words = f"{caption}: {name}" if index == 0 else caption
@@ -98,7 +155,25 @@ def _row(pictures: Sequence[Tensor], captions: Sequence[str], name: str) -> NDAr
     return np.concatenate(cells, axis=1)[:, :-GUTTER]
 
 
+def to_bytes(picture: Tensor) -> NDArray[np.uint8]:
+    """[H,W,3] float sRGB in [0,1] (clamped) or uint8 -> uint8."""
+    if picture.dtype == torch.uint8:
+        return picture.cpu().numpy()
+    return (picture.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+
+
+def encode_jpeg(image: NDArray[np.uint8], quality: int = JPEG_QUALITY) -> bytes:
+    """[H,W,3] uint8 sRGB as a JPEG."""
+    import cv2
+
+    done, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    assert done
+    return data.tobytes()
+
+
 def _write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    import cv2
+
     done, data = cv2.imencode(".png", image[..., ::-1])
     assert done
     write_atomically(path, data.tobytes())

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from advtex_engine.scene import Camera, Fragments, Mesh
+from advtex_engine.threads import in_threads
 
 NEAR = 0.01  # metres
 MAX_BYTES = 256 << 20
@@ -39,6 +40,8 @@ _ITEM_BYTES = 600  # peak of all temporaries per face, span or pixel of a block
 # waits for a second thread, which takes a time slice per kernel where cores are shared with other processes.
 _CPU_BLOCK = 32_000
 
+_PIXEL_BYTES = 60  # of what is kept per pixel of a picture in the making, its result included
+
 _Point = tuple[Tensor, Tensor, Tensor]  # (column u, row v, 1) times z; or the coefficients of a u + b v + c
 
 
@@ -49,28 +52,38 @@ def rasterize(mesh: Mesh, camera: Camera, *, near: float = NEAR, max_bytes: int 
     per vertex and face, 100 per visible face and 30 per pixel. Not differentiable. Faces without area or with corners
     that are not finite are not seen.
     """
-    return next(rasterize_views(mesh, [camera], near=near, max_bytes=max_bytes))
+    return next(rasterize_views(mesh, (camera,), near=near, max_bytes=max_bytes))
 
 
 def rasterize_views(
     mesh: Mesh, cameras: Iterable[Camera], *, near: float = NEAR, max_bytes: int = MAX_BYTES
 ) -> Iterator[Fragments]:
-    """`rasterize` for each camera in turn; the same result, with the work on the mesh done once."""
+    """`rasterize` for each camera in turn; the same result, with the work on the mesh done once.
+
+    On a CPU some cameras are looked through at once, in as many threads as torch uses: a block is too small to share.
+    """
     assert near > 0
     assert max_bytes > 0
     assert len(mesh.t_pos_idx) < _FACE_MASK
+    on_cpu = mesh.v_pos.device.type == "cpu"
     block = max(1, max_bytes // _ITEM_BYTES)
-    if mesh.v_pos.device.type == "cpu":
+    if on_cpu:
         block = min(block, _CPU_BLOCK)
     positions = _columns(mesh.v_pos, torch.float64, block)
     corners = _columns(mesh.t_pos_idx, torch.int64, block)
-    for camera in cameras:
+
+    def seen_by(camera: Camera) -> Fragments:
         points, beyond = _image_points(positions, camera, near, block)
         seen = _in_frustum(beyond, corners, block)
         nearest = _full(camera.height * camera.width, _EMPTY, torch.int64, positions.device, block)
         for part in _blocks(len(seen), block):
             _draw_faces(nearest, points, corners, seen[part], camera, near, block)
-        yield _resolve(nearest, points, corners, camera, block)
+        return _resolve(nearest, points, corners, camera, block)
+
+    cameras = tuple(cameras)
+    largest = max((camera.width * camera.height for camera in cameras), default=1)
+    at_once = min(torch.get_num_threads(), len(cameras), max_bytes // (_PIXEL_BYTES * largest)) if on_cpu else 1
+    yield from in_threads(seen_by, cameras, max(1, at_once))
 
 
 def _image_points(positions: Tensor, camera: Camera, near: float, block: int) -> tuple[Tensor, Tensor]:

@@ -55,7 +55,8 @@ def surface_depths(
 ) -> tuple[list[Camera], Tensor]:
     """The cameras at `size` (width, height) and what they see of the mesh, [V,h,w] float32 metres.
 
-    0 where nothing is hit, near a depth edge, and where the device's depth shows something else than the mesh.
+    0 where nothing is hit, near a depth edge, where the device's depth shows something else than the mesh, and where
+    the view's mask leaves a pixel out.
     """
     width, height = size
     cameras = [scaled_camera(view.camera, width, height) for view in views]
@@ -66,6 +67,9 @@ def surface_depths(
         if view.depth is not None:
             measured = F.interpolate(view.depth[None, None].to(depth.device), (height, width), mode="nearest")[0, 0]
             keep &= (measured == 0) | ((measured - depth).abs() < DEPTH_TOLERANCE[kind])
+        if view.mask is not None:
+            used = view.mask[None, None].to(depth)
+            keep &= -F.adaptive_max_pool2d(-used, (height, width))[0, 0] > 0
         depths.append(torch.where(keep, depth, 0.0))
     return cameras, torch.stack(depths)
 

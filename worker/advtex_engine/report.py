@@ -1,4 +1,4 @@
-"""What a run says about itself: stage times, held-out scores, previews, report.json; and the scene's cache form."""
+"""What a run says about itself: stage times, held-out scores, report.json; and the scene's cache form."""
 
 from __future__ import annotations
 
@@ -21,11 +21,9 @@ from advtex_engine.checkpoint import WorkFolder
 from advtex_engine.errors import Problem, Stopped
 from advtex_engine.evaluate import configured_lpips, score_views
 from advtex_engine.files import write_atomically
-from advtex_engine.monitor import Monitor
-from advtex_engine.previews import contact_sheet, evenly_spread, render_view, side_by_side
+from advtex_engine.monitor import Glimpse, Monitor
 from advtex_engine.scene import Atlas, Camera, Mesh, Scene, View
 
-SHEET_VIEWS = 6
 RESET_PEAK = "5"  # written to clear_refs, it sets VmHWM back to the present resident set: proc(5)
 
 
@@ -63,15 +61,23 @@ class WarningKeeper(Monitor):
         self.stage = stage
         self.inner.stage_started(stage)
 
-    def stage_finished(self, stage: str, seconds: float, peak_memory_bytes: int) -> None:
-        self.inner.stage_finished(stage, seconds, peak_memory_bytes)
+    def stage_finished(
+        self, stage: str, seconds: float, peak_memory_bytes: int, peak_device_memory_bytes: int | None
+    ) -> None:
+        self.inner.stage_finished(stage, seconds, peak_memory_bytes, peak_device_memory_bytes)
 
     def progress(self, step: int, steps: int, losses: Mapping[str, float]) -> None:
         self.inner.progress(step, steps, losses)
 
+    def glimpsed(self, glimpse: Glimpse) -> None:
+        self.inner.glimpsed(glimpse)
+
     def warning(self, problem: Problem) -> None:
         self.warnings.append({"stage": self.stage, **asdict(problem)})
         self.inner.warning(problem)
+
+    def note(self, message: str) -> None:
+        self.inner.note(message)
 
     def checkpointed(self, files: tuple[Path, ...]) -> None:
         self.inner.checkpointed(files)
@@ -104,17 +110,17 @@ class Stages:
         started = time.monotonic()
         yield
         seconds = time.monotonic() - started
-        peak = peak_memory_bytes()
+        peak, on_device = peak_memory_bytes(), peak_device_memory_bytes(self.device)
         self.records.append(
             {
                 "stage": stage,
                 "seconds": round(self._earlier_seconds(stage) + seconds, 3),
                 "peak_memory_bytes": peak,
-                "peak_device_memory_bytes": peak_device_memory_bytes(self.device),
+                "peak_device_memory_bytes": on_device,
                 "resumed": False,
             }
         )
-        self.monitor.stage_finished(stage, seconds, peak)
+        self.monitor.stage_finished(stage, seconds, peak, on_device)
 
     def _earlier_seconds(self, stage: str) -> float:
         """What earlier attempts spent on the stage; of the optimization, the checkpoint tells it."""
@@ -125,7 +131,8 @@ class Stages:
     def restore(self, *stages: str) -> None:
         """Takes over the records of stages whose result was found in the work folder."""
         self.records += [{**self._saved[stage], "resumed": True} for stage in stages if stage in self._saved]
-        self.monitor.warnings += [warning for warning in self._saved_warnings if warning["stage"] in stages]
+        told = self.monitor.warnings  # where a run begins again after it ran out of memory, some are
+        told += [warning for warning in self._saved_warnings if warning["stage"] in stages and warning not in told]
 
     def save(self) -> None:
         self.folder.save("stages", {"records": self.records, "warnings": self.monitor.warnings})
@@ -174,22 +181,6 @@ def heldout_scores(scene: Scene, atlas: Atlas, texture: Tensor, mean: Tensor) ->
     }
 
 
-def write_previews(out: Path, scene: Scene, atlas: Atlas, texture: Tensor, mean: Tensor) -> tuple[Path, ...]:
-    """previews/comparison.png (one view) and previews/sheet.png: photograph | texture | projected mean.
-
-    Held-out views where there are some, else training views from all over the capture.
-    """
-    folder = out / "previews"
-    folder.mkdir(exist_ok=True)
-    views = evenly_spread(scene.heldout or scene.views, SHEET_VIEWS)
-    rows = [[render_view(atlas, candidate, view.camera) for candidate in (texture, mean)] for view in views]
-    comparison, sheet = folder / "comparison.png", folder / "sheet.png"
-    middle = len(views) // 2
-    side_by_side(views[middle], rows[middle][0], rows[middle][1], comparison)
-    contact_sheet(views, rows, ("advtex", "projected mean"), sheet)
-    return comparison, sheet
-
-
 def write_report(out: Path, report: Mapping[str, Any]) -> Path:
     path = out / "report.json"
     write_atomically(path, json.dumps(report, indent=1, default=str).encode() + b"\n")
@@ -221,8 +212,9 @@ def scene_from_dict(saved: Mapping[str, Any]) -> Scene:
 
 
 def _view_to_dict(view: View) -> dict[str, Any]:
-    return {"name": view.name, "camera": asdict(view.camera), "color": view.color, "depth": view.depth}
+    camera = asdict(view.camera)
+    return {"name": view.name, "camera": camera, "color": view.color, "depth": view.depth, "mask": view.mask}
 
 
 def _view_from_dict(saved: Mapping[str, Any]) -> View:
-    return View(saved["name"], Camera(**saved["camera"]), saved["color"], saved["depth"])
+    return View(saved["name"], Camera(**saved["camera"]), saved["color"], saved["depth"], saved["mask"])

@@ -41,17 +41,19 @@ def _project(points: Tensor, relative: Tensor, intrinsics: Tensor) -> tuple[Tens
 
 
 def _visible(
-    position: Tensor, z: Tensor, depth: Tensor, size: tuple[int, int], tolerance: float
+    position: Tensor, z: Tensor, depth: Tensor, size: tuple[int, int], tolerance: float, first: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The visibility test [P]; also the footprint [P,4] (indices, weights) of each position.
 
-    position [P,2] pixels and z [P] metres in the view; depth [H*W] float32 metres of the view; size: width, height.
+    position [P,2] pixels and z [P] metres in the view; depth [H*W] metres of the view; size: width, height. Where depth
+    [V*H*W] is of several views, first [P,1] says where each position's view begins.
     """
     width, height = size
     x, y = position.unbind(1)
     inside = (z > MIN_DEPTH) & (x >= 0.5) & (x <= width - 0.5) & (y >= 0.5) & (y <= height - 0.5)
     indices, weights = bilinear_footprint(position, width, height)
-    around = depth.index_select(0, indices.flatten()).view(indices.shape)
+    pixels = indices if first is None else indices + first
+    around = depth.index_select(0, pixels.flatten()).view(indices.shape).to(torch.float32)
     foreground = around > 0
     # The nearest of the four neighbors decides: a single one would fail along every slanted surface and depth edge.
     difference = torch.where(foreground, (around - z[:, None]).abs(), torch.inf).amin(1)
@@ -65,11 +67,10 @@ def seen_share(points: Tensor, relative: Tensor, maps: ViewMaps, auxiliary: Tens
     relative: [K,3,4] source camera to auxiliary cameras. auxiliary: [K] view indices. tolerance: theta_z, metres.
     """
     position, z = _project(points, relative, maps.intrinsics[auxiliary])
-    shares = []
-    for view, (pixels, distance) in zip(auxiliary, zip(position, z, strict=True), strict=True):
-        visible, _, _ = _visible(pixels, distance, _depth_of(maps, view), (maps.width, maps.height), tolerance)
-        shares.append(visible.to(torch.float32).mean())
-    return torch.stack(shares)
+    first = (auxiliary * (maps.width * maps.height)).repeat_interleave(len(points))[:, None]
+    size = (maps.width, maps.height)
+    visible, _, _ = _visible(position.flatten(0, 1), z.flatten(), maps.depth.view(-1), size, tolerance, first)
+    return visible.view(z.shape).to(torch.float32).mean(1)
 
 
 def reproject(
@@ -80,7 +81,7 @@ def reproject(
     points: [P,3] metres in the source camera. relative: [3,4] source camera to auxiliary camera. auxiliary: 0-dim view
     index. tolerance: theta_z, metres. Colors are bilinear; where invisible they mean nothing.
     """
-    position, z = _project(points, relative, maps.intrinsics[auxiliary])
+    position, z = _project(points, relative, maps.intrinsics.index_select(0, auxiliary.view(1))[0])
     depth = _depth_of(maps, auxiliary)
     visible, indices, weights = _visible(position, z, depth, (maps.width, maps.height), tolerance)
     image = maps.color.index_select(0, auxiliary.view(1))[0].to(torch.float32)

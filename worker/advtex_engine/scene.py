@@ -28,20 +28,45 @@ class Camera:
 
 
 @dataclass(frozen=True)
+class DepthFrame:
+    """What a depth camera measured: depth [H,W] float32 metres along z, 0 = no reading.
+
+    confidence: [H,W] float32 in [0, 1], 0 = not to be used; None where the device tells none.
+    """
+
+    camera: Camera
+    depth: Tensor
+    confidence: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        assert self.depth.shape == (self.camera.height, self.camera.width)
+        assert self.confidence is None or self.confidence.shape == self.depth.shape
+
+    @property
+    def readings(self) -> Tensor:
+        """The depth [H,W] that may be used: 0 also where there is no confidence in it."""
+        return self.depth if self.confidence is None else torch.where(self.confidence > 0, self.depth, 0.0)
+
+
+@dataclass(frozen=True)
 class View:
     """A frame that the engine uses: color [H,W,3] uint8 sRGB at the working size, its camera, and device depth.
 
     depth: [H,W] float32 metres along z, seen by the color camera, 0 = no reading; None when the scan has none.
+    mask: [H,W] bool, False where the view must not be used; None when all of it may. Readers of scans fill such pixels
+    with the colors around them, so that no filter brings in what they showed.
     """
 
     name: str
     camera: Camera
     color: Tensor
     depth: Tensor | None = None
+    mask: Tensor | None = None
 
     def __post_init__(self) -> None:
         assert self.color.shape == (self.camera.height, self.camera.width, 3) and self.color.dtype == torch.uint8
         assert self.depth is None or self.depth.shape == (self.camera.height, self.camera.width)
+        assert self.mask is None or self.mask.shape == (self.camera.height, self.camera.width)
 
 
 @dataclass(frozen=True)
@@ -67,7 +92,8 @@ class Mesh:
 class Atlas:
     """A mesh with an injective parameterization and the texture's size in texels.
 
-    mesh.v_uv and mesh.t_uv_idx are set; `source` says where the uv came from: "xatlas" or "scan".
+    mesh.v_uv and mesh.t_uv_idx are set; `source` says where the uv came from: "xatlas" or "scan". The texture is a grid
+    of pages x pages equal pages, each exported as an image of its own: every face lies within one of them.
     """
 
     mesh: Mesh
@@ -75,6 +101,7 @@ class Atlas:
     height: int
     source: str
     charts: int
+    pages: int = 1
 
     def __post_init__(self) -> None:
         assert self.mesh.v_uv is not None

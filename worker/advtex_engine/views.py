@@ -1,12 +1,14 @@
-"""All views on the device as compact types, and the pairs that the loader draws from (paper section 3.3).
+"""All views as compact types, and the pairs that the loader draws from (paper section 3.3).
 
 Per view and pixel: color 3 bytes, uv 4 bytes (two int16), depth 2 bytes (float16 metres): 9 bytes, 2.8 MB at 640x480.
+Views that do not fit on the device stay on the host, and go there one by one (`ViewMaps.only`) or by blocks
+(`streaming.py`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,11 +17,16 @@ from torch import Tensor
 from advtex_engine.rasterize import rasterize_views
 from advtex_engine.reproject import seen_share, unproject_pixels
 from advtex_engine.scene import Atlas, View
-from advtex_engine.texture import encode_uv, touched_slots
+from advtex_engine.texture import encode_uv, number_slots, touched_slots
 
 DEPTH_TOLERANCE = {"object": 0.03, "scene": 0.1}  # theta_z, metres (paper section 3.3)
+BYTES_PER_PIXEL = 9
 OVERLAP_STRIDE = 8  # pixels; overlaps are estimated on a coarser grid
 WIDEST_PAIR = 60.0  # degrees between the optical axes, for views that have no nearer neighbor
+TOGETHER = 32  # views of the host that are on the device at once
+
+Allocate = Callable[[tuple[int, ...], torch.dtype], Tensor]
+"""Shape and type -> a tensor with any content, where views are to be kept."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +34,10 @@ class ViewMaps:
     """What the optimization reads, V views of H x W pixels.
 
     color: [V,H*W,3] uint8. uv: [V,H*W,2] int16 (texture.encode_uv). depth: [V,H*W] float16 metres along z, rendered
-    from the mesh; 0 = background (no mesh, or the device's depth contradicts the mesh).
+    from the mesh; 0 = background (no mesh, the device's depth contradicts the mesh, or the view's mask leaves it out).
     intrinsics: [V,4] float32 fx, fy, cx, cy in pixels. world_to_camera: [V,4,4] float64.
     slot_map: [texture height, texture width] int32, rows of the compact texture, -1 = sampled by no view.
+    Color, uv and depth may lie on the host; all else is on the device that computes.
     """
 
     color: Tensor
@@ -45,6 +53,23 @@ class ViewMaps:
     @property
     def count(self) -> int:
         return self.color.shape[0]
+
+    @property
+    def device(self) -> torch.device:
+        """Of the computations; color, uv and depth may lie elsewhere."""
+        return self.slot_map.device
+
+    def only(self, view: int) -> ViewMaps:
+        """One of the views, on the device; it shares the memory of what is there already."""
+        part = slice(view, view + 1)
+        return replace(
+            self,
+            color=self.color[part].to(self.device),
+            uv=self.uv[part].to(self.device),
+            depth=self.depth[part].to(self.device),
+            intrinsics=self.intrinsics[part],
+            world_to_camera=self.world_to_camera[part],
+        )
 
     def to(self, device: torch.device) -> ViewMaps:
         """The same maps on another device."""
@@ -74,8 +99,10 @@ class Pairs:
     relative: Tensor
 
 
-def build_view_maps(atlas: Atlas, views: tuple[View, ...], kind: str) -> ViewMaps:
+def build_view_maps(atlas: Atlas, views: tuple[View, ...], kind: str, allocate: Allocate | None = None) -> ViewMaps:
     """Rasterizes every view: view-to-texture map, depth and foreground.
+
+    allocate: makes what color, uv and depth are kept in; by default on the mesh's device.
 
     Device depth masks what the mesh lacks: a pixel whose measured depth differs from the mesh's by more than theta_z
     shows something else than the mesh.
@@ -86,22 +113,34 @@ def build_view_maps(atlas: Atlas, views: tuple[View, ...], kind: str) -> ViewMap
     mesh, device = atlas.mesh, atlas.mesh.v_pos.device
     assert mesh.v_uv is not None and mesh.t_uv_idx is not None
     width, height, tolerance = views[0].camera.width, views[0].camera.height, DEPTH_TOLERANCE[kind]
-    uv, depth = [], []
-    for view, fragments in zip(views, rasterize_views(mesh, [view.camera for view in views]), strict=True):
+    allocate = allocate or (lambda shape, dtype: torch.empty(shape, dtype=dtype, device=device))
+    count, pixels = len(views), width * height
+    color = allocate((count, pixels, 3), torch.uint8)
+    uv = allocate((count, pixels, 2), torch.int16)
+    depth = allocate((count, pixels), torch.float16)
+    touched = torch.zeros((atlas.height, atlas.width), dtype=torch.bool, device=device)
+    rasterized = rasterize_views(mesh, [view.camera for view in views])
+    for index, (view, fragments) in enumerate(zip(views, rasterized, strict=True)):
         hit = fragments.face_index >= 0
         if view.depth is not None:
             measured = view.depth.to(device)
             hit = hit & ((measured == 0) | ((measured - fragments.depth).abs() < tolerance))
+        if view.mask is not None:
+            hit = hit & view.mask.to(device)
         corners = mesh.v_uv[mesh.t_uv_idx[fragments.face_index.clamp(min=0).long()]]
-        uv.append(encode_uv((corners * fragments.barycentric[..., None]).sum(2)))
-        depth.append(torch.where(hit, fragments.depth, 0.0).to(torch.float16))
-    uv_codes, depths = torch.stack(uv), torch.stack(depth)
-    slot_map, slots = touched_slots(uv_codes, depths > 0, atlas.width, atlas.height)
+        color[index] = view.color.view(-1, 3)
+        uv[index] = encode_uv((corners * fragments.barycentric[..., None]).sum(2)).view(-1, 2)
+        depth[index] = torch.where(hit, fragments.depth, 0.0).flatten()
+        if index % TOGETHER == TOGETHER - 1 or index == count - 1:
+            newest = slice(index - index % TOGETHER, index + 1)
+            codes, seen = uv[newest].to(device), depth[newest].to(device) > 0
+            touched |= touched_slots(codes[:, None], seen[:, None], atlas.width, atlas.height)[0] >= 0
+    slot_map, slots = number_slots(touched)
     K = torch.stack([view.camera.K for view in views])
     return ViewMaps(
-        color=torch.stack([view.color for view in views]).to(device).reshape(len(views), -1, 3),
-        uv=uv_codes.reshape(len(views), -1, 2),
-        depth=depths.reshape(len(views), -1),
+        color=color,
+        uv=uv,
+        depth=depth,
         intrinsics=torch.stack((K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2]), 1).to(device, torch.float32),
         world_to_camera=torch.stack([view.camera.world_to_camera for view in views]).to(device, torch.float64),
         slot_map=slot_map,
@@ -116,32 +155,47 @@ def overlaps(maps: ViewMaps, kind: str, max_angle: float, sources: Iterable[int]
 
     The angle is that between the optical axes. Estimated on every OVERLAP_STRIDE-th pixel, for the given sources only.
     """
-    device = maps.depth.device
+    device = maps.device
     axes = maps.world_to_camera[:, 2, :3]
     near = (axes @ axes.T).clamp(-1, 1) >= math.cos(math.radians(max_angle))
-    ys = torch.arange(OVERLAP_STRIDE // 2, maps.height, OVERLAP_STRIDE, device=device)
-    xs = torch.arange(OVERLAP_STRIDE // 2, maps.width, OVERLAP_STRIDE, device=device)
-    pixels = (ys[:, None] * maps.width + xs).flatten()
-    xy = torch.stack((xs.repeat(len(ys)), ys.repeat_interleave(len(xs))), 1) + 0.5
+    ys = torch.arange(OVERLAP_STRIDE // 2, maps.height, OVERLAP_STRIDE)
+    xs = torch.arange(OVERLAP_STRIDE // 2, maps.width, OVERLAP_STRIDE)
+    pixels = (ys[:, None] * maps.width + xs).flatten().to(maps.depth.device)
+    xy = (torch.stack((xs.repeat(len(ys)), ys.repeat_interleave(len(xs))), 1) + 0.5).to(device)
     share = torch.zeros((maps.count, maps.count), device=device)
     camera_to_world = torch.linalg.inv(maps.world_to_camera)
     for source in sources:
-        depth = maps.depth[source, pixels].to(torch.float32)
+        depth = maps.depth[source, pixels].to(device, torch.float32)
         seen = depth > 0
         auxiliary = near[source].nonzero().flatten()
         if not bool(seen.any()):
             continue
         points = unproject_pixels(xy[seen], depth[seen], maps.intrinsics[source])
-        relative = (maps.world_to_camera[auxiliary] @ camera_to_world[source])[:, :3].to(torch.float32)
-        share[source, auxiliary] = seen_share(points, relative, maps, auxiliary, DEPTH_TOLERANCE[kind])
+        for some in torch.split(auxiliary, TOGETHER):
+            relative = (maps.world_to_camera[some] @ camera_to_world[source])[:, :3].to(torch.float32)
+            share[source, some] = _seen_share(points, relative, maps, some, DEPTH_TOLERANCE[kind])
     return share
+
+
+def _seen_share(points: Tensor, relative: Tensor, maps: ViewMaps, auxiliary: Tensor, tolerance: float) -> Tensor:
+    """`seen_share`, for views that lie on the host too."""
+    if maps.depth.device == maps.device:
+        return seen_share(points, relative, maps, auxiliary, tolerance)
+    depth = maps.depth[auxiliary.to(maps.depth.device)].to(maps.device)
+    there = replace(maps, depth=depth, intrinsics=maps.intrinsics[auxiliary])
+    return seen_share(points, relative, there, torch.arange(len(auxiliary), device=maps.device), tolerance)
+
+
+def foregrounds(maps: ViewMaps) -> Tensor:
+    """[V] bool, which views see anything of the mesh."""
+    return torch.stack([(depth > 0).any() for depth in maps.depth]).to(maps.device)
 
 
 def own_pairs(maps: ViewMaps) -> Pairs:
     """Every view with itself alone: the ablation without auxiliary views (paper section 4)."""
-    views = torch.arange(maps.count, device=maps.depth.device)
-    has_foreground = (maps.depth > 0).any(1)
-    relative = torch.eye(4, device=maps.depth.device)[:3].repeat(maps.count, 1, 1, 1)
+    views = torch.arange(maps.count, device=maps.device)
+    has_foreground = foregrounds(maps)
+    relative = torch.eye(4, device=maps.device)[:3].repeat(maps.count, 1, 1, 1)
     return Pairs(views[:, None], has_foreground.long(), has_foreground.nonzero().flatten(), relative)
 
 
@@ -151,7 +205,7 @@ def related_pairs(maps: ViewMaps, kind: str, max_angle: float, min_overlap: floa
     The view itself is a candidate once (released code). A view without any other candidate gets the view that overlaps
     it most, whatever the angle, so that sparse scans still learn from misaligned pairs.
     """
-    count, device = maps.count, maps.depth.device
+    count, device = maps.count, maps.device
     share = overlaps(maps, kind, max_angle, range(count))
     related = (share > min_overlap).fill_diagonal_(False)
     lonely = (~related.any(1)).nonzero().flatten().tolist()
@@ -163,7 +217,7 @@ def related_pairs(maps: ViewMaps, kind: str, max_angle: float, min_overlap: floa
     candidates = [[source, *related[source].nonzero().flatten().tolist()] for source in range(count)]
     width = max(len(row) for row in candidates)
     auxiliary = torch.tensor([row + [row[0]] * (width - len(row)) for row in candidates], device=device)
-    has_foreground = (maps.depth > 0).any(1)
+    has_foreground = foregrounds(maps)
     number = torch.tensor([len(row) for row in candidates], device=device) * has_foreground
     relative = maps.world_to_camera[auxiliary] @ torch.linalg.inv(maps.world_to_camera)[:, None]
     return Pairs(

@@ -11,9 +11,11 @@ from torch import Tensor
 from advtex_engine.checkpoint import Checkpoints
 from advtex_engine.discriminator import PatchDiscriminator
 from advtex_engine.errors import Stopped
+from advtex_engine.graphed import Stepper
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.methods.mean import dense_texture
 from advtex_engine.optimize import AdversarialOptimizer
+from advtex_engine.streaming import PairViews, pair_views
 from advtex_engine.views import Pairs, ViewMaps, own_pairs, related_pairs
 
 HISTORY_POINTS = 200  # loss means kept for the report and shown as progress
@@ -35,21 +37,26 @@ def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     the monitor asks for it. On a CPU the result does not depend on whether and where the run was interrupted.
     """
     preset = given.preset
-    device = given.maps[1].color.device
+    device = given.maps[1].device
     # Weights are drawn on the CPU, so that a run starts from the same discriminator on every device.
     discriminator = PatchDiscriminator(torch.Generator().manual_seed(given.config.seed)).to(device)
     generator = torch.Generator(device).manual_seed(given.config.seed)
     checkpoints = Checkpoints(given.work, given.config.checkpoint_seconds)
     saved = checkpoints.load()
     run = _Run(saved["level"], saved["step"], saved["losses"]) if saved else _Run(0, 0, [])
+    if saved:
+        given.live.quality = saved["quality"]
     texture = _start(given)
     for number, level in enumerate(preset.levels):
         if number < run.level:
             continue
         maps = given.maps[level.scale]
+        # Smaller views need less room each.
+        on_device = None if given.on_device is None else given.on_device * level.scale**2
+        views = pair_views(maps, _pairs(given, maps), on_device, given.config.seed)
         optimizer = AdversarialOptimizer(
-            maps,
-            _pairs(given, maps),
+            views.maps,
+            views.pairs,
             _compact(maps, texture),
             preset,
             kind=given.scene.kind,
@@ -60,9 +67,11 @@ def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
         optimizer.index = run.step
         if saved:
             optimizer.load_state_dict(saved["optimizer"])
+            views.load_state_dict(saved["views"])
             saved = None
-        _run_level(given, optimizer, run, sum(part.steps for part in preset.levels[: number + 1]), checkpoints)
+        _run_level(given, optimizer, views, run, sum(part.steps for part in preset.levels[: number + 1]), checkpoints)
         texture = dense_texture(maps, optimizer.result)
+        del optimizer, views  # before the next level makes its own
         run.level = number + 1
     return texture.clamp(0, 1), run.losses
 
@@ -84,24 +93,34 @@ def _pairs(given: MethodInput, maps: ViewMaps) -> Pairs:
 
 
 def _run_level(
-    given: MethodInput, optimizer: AdversarialOptimizer, run: _Run, end: int, checkpoints: Checkpoints
+    given: MethodInput,
+    optimizer: AdversarialOptimizer,
+    views: PairViews,
+    run: _Run,
+    end: int,
+    checkpoints: Checkpoints,
 ) -> None:
     total = given.preset.steps
     every = max(1, total // HISTORY_POINTS)
+    stepper = Stepper(optimizer)
     while run.step < end:
-        optimizer.step()
-        run.step += 1
-        if run.step % every == 0 or run.step == end:
+        before = run.step
+        run.step += stepper.take(end - run.step)
+        views.advance(run.step - before)
+        if run.step // every > before // every or run.step == end:
             losses = optimizer.drain_losses()
             run.losses.append({"step": run.step, **losses})
             given.monitor.progress(run.step, total, losses)
+        if run.step == total or given.live.due():
+            mean = given.means[given.preset.levels[run.level].scale]
+            given.live.show(run.step, optimizer.maps, optimizer.result, mean, run.losses)
         stop = given.monitor.stop_requested()
         if stop or checkpoints.due():
-            checkpoints.save(
-                {"level": run.level, "step": run.step, "losses": run.losses, "optimizer": optimizer.state_dict()}
-            )
+            state = {"level": run.level, "step": run.step, "losses": run.losses, "quality": given.live.quality}
+            checkpoints.save({**state, "optimizer": optimizer.state_dict(), "views": views.state_dict()})
         if stop:
             raise Stopped(f"stopped after step {run.step} of {total}; resume goes on from there")
+    given.facts["step"] = stepper.describe()
 
 
 def _start(given: MethodInput) -> Tensor:

@@ -70,11 +70,11 @@ def paint(given: MethodInput, texels: TexelMap, labels: Tensor) -> Tensor:
     label = labels[texels.face]
     texture = given.means[1].clone()
     flat = texture.view(-1, 3)
+    first = torch.tensor(0, device=labels.device)
     for view in range(maps.count):
         chosen = (label == view).nonzero()[:, 0]
-        index = torch.tensor(view, device=labels.device)
         to_camera = maps.world_to_camera[view, :3].to(torch.float32)
-        color, visible = reproject(points[chosen], to_camera, maps, index, tolerance)
+        color, visible = reproject(points[chosen], to_camera, maps.only(view), first, tolerance)
         flat[texels.texel[chosen[visible]]] = color[visible] / 255
     known = torch.zeros(texture.shape[:2], dtype=torch.bool, device=texture.device)
     known.view(-1)[texels.texel] = True
@@ -84,7 +84,8 @@ def paint(given: MethodInput, texels: TexelMap, labels: Tensor) -> Tensor:
 def _visible_pixels(maps: ViewMaps, view: int, face_of: Tensor, count: int) -> Tensor:
     """How many pixels of a view show each face [count]."""
     height, width = maps.slot_map.shape
-    uv = decode_uv(maps.uv[view][maps.depth[view] > 0])
+    seen = maps.only(view)
+    uv = decode_uv(seen.uv[0][seen.depth[0] > 0])
     column = (uv[:, 0] * width).long().clamp(max=width - 1)
     row = (uv[:, 1] * height).long().clamp(max=height - 1)
     face = face_of[row * width + column]

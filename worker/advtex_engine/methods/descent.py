@@ -11,6 +11,7 @@ from advtex_engine.checkpoint import Checkpoints
 from advtex_engine.errors import Stopped
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.methods.mean import dense_texture
+from advtex_engine.streaming import PairViews
 
 LR = 1e-3
 """Learning rate of the first step, in colors of [0, 1]; it falls to zero in a straight line, so that the last steps
@@ -22,12 +23,18 @@ Loss = Callable[[Tensor, int], Tensor]
 
 
 def descend(
-    given: MethodInput, name: str, loss: Loss, steps: int, generator: torch.Generator
+    given: MethodInput,
+    name: str,
+    loss: Loss,
+    steps: int,
+    generator: torch.Generator,
+    views: PairViews | None = None,
 ) -> tuple[Tensor, list[LossPoint]]:
     """Minimizes `loss` from the mean texture -> dense texture [H,W,3] float32 in [0,1] and the history of the loss.
 
     name: of the loss in the history. generator: all that `loss` draws from; its state goes into the checkpoint, so a
-    run that is stopped and resumed gives the same texture. Raises Stopped, after a checkpoint, when the monitor asks.
+    run that is stopped and resumed gives the same texture. views: what `loss` draws its views from, if it draws pairs.
+    Raises Stopped, after a checkpoint, when the monitor asks.
     """
     maps = given.maps[1]
     values = given.means[1][maps.slot_map >= 0].clone().requires_grad_(True)
@@ -38,26 +45,34 @@ def descend(
     saved = checkpoints.load()
     if saved is not None:
         first, losses = saved["step"], saved["losses"]
+        given.live.quality = saved["quality"]
         values.data.copy_(saved["values"])
         total.copy_(saved["total"])
         adam.load_state_dict(saved["adam"])
         generator.set_state(saved["generator"])
+        if views is not None:
+            views.load_state_dict(saved["views"])
     every = max(1, steps // HISTORY_POINTS)
     for step in range(first, steps):
         adam.param_groups[0]["lr"] = LR * (1 - step / steps)
         value = loss(values, step)
         (values.grad,) = torch.autograd.grad(value, [values])
         adam.step()
+        if views is not None:
+            views.advance(1)
         total += value.detach()
         done = step + 1
         if done % every == 0 or done == steps:
             losses.append({"step": done, name: float(total) / (done - (losses[-1]["step"] if losses else 0))})
             given.monitor.progress(done, steps, {name: losses[-1][name]})
             total.zero_()
+        if done == steps or given.live.due():
+            given.live.show(done, maps, values, given.means[1], losses)
         stop = given.monitor.stop_requested() and done < steps
         if stop or checkpoints.due():
-            state = {"step": done, "losses": losses, "values": values.detach(), "total": total}
-            checkpoints.save({**state, "adam": adam.state_dict(), "generator": generator.get_state()})
+            state = {"step": done, "losses": losses, "quality": given.live.quality, "values": values.detach()}
+            state |= {"total": total, "adam": adam.state_dict(), "generator": generator.get_state()}
+            checkpoints.save({**state, "views": views.state_dict() if views is not None else {}})
         if stop:
             raise Stopped(f"stopped after step {done} of {steps}; resume goes on from there")
     return dense_texture(maps, values.detach()).clamp(0, 1), losses

@@ -13,7 +13,7 @@ from torch import Tensor
 from advtex_engine.methods.descent import descend
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.texture import bilinear_footprint, decode_uv, sample_texels
-from advtex_engine.views import ViewMaps
+from advtex_engine.views import ViewMaps, foregrounds
 
 PASSES = 20  # over all views, unless the number of steps is asked for
 
@@ -23,15 +23,15 @@ def l1(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
 
     Raises Stopped, after a checkpoint.
     """
-    maps, device = given.maps[1], given.maps[1].color.device
+    maps, device = given.maps[1], given.maps[1].device
     generator = torch.Generator().manual_seed(given.config.seed)
-    seen = [view for view in range(maps.count) if bool((maps.depth[view] > 0).any())]
+    seen: list[int] = foregrounds(maps).nonzero().flatten().tolist()
     steps = given.config.steps or PASSES * len(seen)
     order = [seen[index] for _ in range(-(-steps // len(seen))) for index in _shuffled(len(seen), generator)]
     size = torch.tensor(maps.slot_map.shape[::-1], dtype=torch.float32, device=device)
 
     def distance(values: Tensor, step: int) -> Tensor:
-        photograph, slots, weights = _footprints(maps, order[step], size)
+        photograph, slots, weights = _footprints(maps.only(order[step]), size)
         return (sample_texels(values, slots, weights) - photograph).abs().mean()
 
     return descend(given, "l1", distance, steps, generator)
@@ -42,10 +42,10 @@ def _shuffled(count: int, generator: torch.Generator) -> list[int]:
     return drawn
 
 
-def _footprints(maps: ViewMaps, view: int, size: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Colors [P,3] in [0,1] of a view's foreground, and where they sample the texture: slots [P,4], weights [P,4]."""
-    seen = maps.depth[view] > 0
-    height, width = maps.slot_map.shape
-    texels, weights = bilinear_footprint(decode_uv(maps.uv[view][seen]) * size, width, height)
-    slots = maps.slot_map.flatten()[texels].clamp(min=0)
-    return maps.color[view][seen].to(torch.float32) / 255, slots, weights
+def _footprints(view: ViewMaps, size: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Colors [P,3] in [0,1] of one view's foreground, and where they sample the texture: slots [P,4], weights [P,4]."""
+    seen = view.depth[0] > 0
+    height, width = view.slot_map.shape
+    texels, weights = bilinear_footprint(decode_uv(view.uv[0][seen]) * size, width, height)
+    slots = view.slot_map.flatten()[texels].clamp(min=0)
+    return view.color[0][seen].to(torch.float32) / 255, slots, weights

@@ -18,16 +18,17 @@ def mean(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
 def mean_texture(maps: ViewMaps) -> Tensor:
     """Splats all foreground pixels with their bilinear weights, normalizes, fills the rest -> [H,W,3] in [0,1]."""
     height, width = maps.slot_map.shape
-    device = maps.color.device
+    device = maps.device
     size = torch.tensor([width, height], dtype=torch.float32, device=device)
     total = torch.zeros((maps.slots, 3), device=device)
     weight = torch.zeros(maps.slots, device=device)
     flat_slots = maps.slot_map.flatten()
-    for view in range(maps.count):
-        seen = maps.depth[view] > 0
-        texels, weights = bilinear_footprint(decode_uv(maps.uv[view][seen]) * size, width, height)
+    for index in range(maps.count):
+        view = maps.only(index)
+        seen = view.depth[0] > 0
+        texels, weights = bilinear_footprint(decode_uv(view.uv[0][seen]) * size, width, height)
         slots = flat_slots[texels].clamp(min=0)
-        color = maps.color[view][seen].to(torch.float32) / 255
+        color = view.color[0][seen].to(torch.float32) / 255
         total.index_add_(0, slots.flatten(), (color[:, None, :] * weights[:, :, None]).flatten(0, 1))
         weight.index_add_(0, slots.flatten(), weights.flatten())
     return dense_texture(maps, total / weight.clamp(min=1e-6)[:, None])

@@ -31,8 +31,9 @@ def sharpness(maps: ViewMaps, view: int) -> float:
 
     "The blur effect: perception and estimation with a new no-reference perceptual blur metric"; over the foreground.
     """
-    image = luminance(maps.color[view].view(maps.height, maps.width, 3)) / 255
+    maps = maps.only(view)
+    image = luminance(maps.color[0].view(maps.height, maps.width, 3)) / 255
     blurred = F.avg_pool2d(image[None, None], BLUR, 1, BLUR // 2, count_include_pad=False)[0, 0]
-    foreground = (maps.depth[view] > 0).view(maps.height, maps.width)
+    foreground = (maps.depth[0] > 0).view(maps.height, maps.width)
     before, after = (gradient_magnitude(plane)[foreground].sum() for plane in (image, blurred))
     return float(1 - (after / before.clamp(min=torch.finfo(before.dtype).tiny)).clamp(max=1))

@@ -18,6 +18,7 @@ from advtex_engine.batches import PairSampler
 from advtex_engine.methods.descent import descend
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.perceptual import FeatureStack, load_features
+from advtex_engine.streaming import pair_views
 from advtex_engine.texture import sample_texels
 from advtex_engine.views import related_pairs
 
@@ -35,11 +36,12 @@ def vgg(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     without weights (see `load_vgg`), and Stopped, after a checkpoint.
     """
     maps, preset, kind = given.maps[1], given.preset, given.scene.kind
-    device = maps.color.device
+    device = maps.device
     features = load_vgg().to(device)
     generator = torch.Generator(device).manual_seed(given.config.seed)
     pairs = related_pairs(maps, kind, preset.max_pair_angle, preset.min_pair_overlap)
-    sampler = PairSampler(maps, pairs, kind, (min(CROP, maps.width), min(CROP, maps.height)), generator)
+    views = pair_views(maps, pairs, given.on_device, given.config.seed)
+    sampler = PairSampler(views.maps, views.pairs, kind, (min(CROP, maps.width), min(CROP, maps.height)), generator)
 
     def distance(values: Tensor, _step: int) -> Tensor:
         batch = sampler.draw()
@@ -51,7 +53,7 @@ def vgg(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
             wanted = features(torch.where(batch.visible > 0, (batch.real + 1) / 2, around))
         return torch.stack([(a - b).abs().mean() for a, b in zip(features(fake), wanted, strict=True)]).sum()
 
-    return descend(given, "vgg", distance, preset.steps, generator)
+    return descend(given, "vgg", distance, preset.steps, generator, views)
 
 
 def load_vgg() -> FeatureStack:

@@ -1,0 +1,233 @@
+"""What an optimization needs of its device's memory, and what the device has.
+
+Every part is counted from sizes and types: view maps, slot maps and dense textures as they are stored; per texel of the
+compact texture its value, gradient, Adam's moments and what the preset keeps beside them; the discriminator; the
+activations of the crop by layer; and what else a step holds per pixel of the crop. The last was read off torch's
+allocator, as the bytes alive at the fullest moment of a step.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from advtex_engine.config import Preset
+from advtex_engine.optimize import crop_size
+from advtex_engine.views import BYTES_PER_PIXEL, ViewMaps
+
+FLOAT = 4
+TEXEL = 3 * FLOAT  # of a texture, three channels
+SLOT = 4  # of a slot map
+LAYERS = ((64, 2), (128, 2), (128, 2), (128, 1), (1, 1))  # channels and strides of the discriminator
+PARAMETERS = 664_001
+SCHEDULED = 5 * FLOAT  # per step of the run, its row of the schedule
+CONTEXT = 500 << 20  # of CUDA and its libraries; no tensor, so not among those that torch's allocator counts
+# Per pixel of the crop. With features the fullest moment is at the beginning of the texture's gradient, while examples
+# and footprints are still needed, without them in the discriminator's gradient.
+HELD_WITH_FEATURES, HELD = 78, 5
+SPREAD, SPREAD_PIXEL = 16, 6  # or it is where the texture's gradient is made: per texel, per pixel of the crop
+CONVOLUTIONS = 360  # per pixel of the crop: what oneDNN keeps by itself, on a CPU
+LIBRARIES = 124 << 20  # on a CPU: code, tables and threads of what steps are the first to use; 100 to 155 were seen
+FILLING = 79  # per texel of a dense texture that is made from a compact one
+SPLATTING = 240  # per pixel of a view that is averaged into the mean texture
+VGG_PIXEL = 10_000  # per pixel of the crop of its features' network, both examples
+VGG_CROP = 128
+
+
+@dataclass(frozen=True)
+class Workload:
+    """What decides the memory of an optimization.
+
+    views: of width x height pixels, all of them. texture: width and height. slots: texels that views sample.
+    device: "cpu" or "cuda". bfloat16: whether the networks' activations are.
+    """
+
+    views: int
+    width: int
+    height: int
+    texture: tuple[int, int]
+    slots: int
+    method: str
+    preset: Preset
+    device: str = "cpu"
+    bfloat16: bool = False
+
+    @property
+    def draws_pairs(self) -> bool:
+        """Whether the method has a step that draws a pair of views, and can do with a part of them at a time."""
+        return self.plays or self.method == "vgg"
+
+    @property
+    def plays(self) -> bool:
+        """Whether there is a discriminator."""
+        return self.method.startswith("adversarial")
+
+    @property
+    def crop(self) -> tuple[int, int]:
+        """Of a step at full size."""
+        return crop_size(self.width, self.height, self.preset.max_crop)
+
+    @property
+    def scales(self) -> tuple[int, ...]:
+        """Those of which maps are kept."""
+        return tuple(sorted({1, *(level.scale for level in self.preset.levels)}))
+
+
+def estimate(work: Workload, on_device: int | None = None) -> dict[str, int]:
+    """Bytes by part; their sum is the peak. on_device: views of full size that are there at a time, None for all."""
+    texels = work.texture[0] * work.texture[1]
+    shares = sum(1 / scale**2 for scale in work.scales)
+    views = work.views * shares if on_device is None else on_device
+    starts = work.plays and work.preset.start == "selection"
+    step = _step(work)
+    filling = max(FILLING * texels, SPLATTING * work.width * work.height)
+    parts = {
+        "view_maps": int(views * work.width * work.height * BYTES_PER_PIXEL),
+        "slot_maps": int(texels * SLOT * shares),
+        "dense_textures": int(texels * TEXEL * (shares + starts)),
+        **step,
+        # Before and after the steps: what a step needs is not there then, apart from the texture's own state.
+        "filling": max(0, filling - step["activations"] - step["step"]),
+    }
+    if work.device == "cuda":
+        parts["context"] = CONTEXT
+    elif work.plays:
+        parts["convolutions"] = CONVOLUTIONS * work.crop[0] * work.crop[1]
+        parts["libraries"] = LIBRARIES
+    return parts
+
+
+def tensor_bytes(parts: dict[str, int]) -> int:
+    """Of an estimate: what torch's allocator counts."""
+    return sum(size for name, size in parts.items() if name not in ("context", "convolutions", "libraries"))
+
+
+def activations(width: int, height: int, size: int) -> list[int]:
+    """Bytes that are kept of each of the discriminator's layers for its gradient, for one example, `size` per value.
+
+    A convolution's output is kept, and what the leaky ReLU makes of it, apart from the last one's, which has none.
+    """
+    kept = []
+    for number, (channels, stride) in enumerate(LAYERS):
+        width, height = (width - 2) // stride + 1, (height - 2) // stride + 1
+        kept.append(channels * width * height * size * (2 if number < len(LAYERS) - 1 else 1))
+    return kept
+
+
+def _step(work: Workload) -> dict[str, int]:
+    if work.method == "vgg":
+        pixels = min(VGG_CROP, work.width) * min(VGG_CROP, work.height)
+        return {"compact_texture": 4 * TEXEL * work.slots, "activations": VGG_PIXEL * pixels, "step": 0}
+    if work.method == "l1":  # spread over four texels per pixel, with their indices and weights
+        return {"compact_texture": 5 * TEXEL * work.slots, "activations": 0, "step": 200 * work.width * work.height}
+    if not work.plays:
+        return {"compact_texture": 2 * TEXEL * work.slots, "activations": 0, "step": 0}
+    preset, (width, height) = work.preset, work.crop
+    # Value, gradient and two moments.
+    beside = (preset.l1_target == "start") + bool(preset.averaging)
+    size = 2 if work.bfloat16 else FLOAT
+    pixels = width * height
+    on_gpu = work.device == "cuda"
+    # On a CPU both examples are float32, and are copied where the activations are not.
+    shown = 2 * 8 * size * pixels if on_gpu else 2 * 6 * (FLOAT + size % FLOAT) * pixels
+    features = bool(preset.feature_weight)
+    differences = sum(activations(width, height, FLOAT)[:-1]) // 2 if features else 0
+    held = (HELD_WITH_FEATURES if features else HELD) * pixels
+    fullest = max(shown + held, SPREAD * work.slots + SPREAD_PIXEL * pixels)
+    return {
+        "compact_texture": (4 + beside) * TEXEL * work.slots,
+        "discriminator": (4 * FLOAT + (2 if work.bfloat16 else 0)) * PARAMETERS + SCHEDULED * preset.steps,
+        "activations": 2 * sum(activations(width, height, size)),
+        "step": differences + fullest,
+    }
+
+
+def resident_memory() -> int | None:
+    """Of this process; None where the system does not tell."""
+    if sys.platform != "linux":
+        return None
+    return _field(Path("/proc/self/status").read_text(), "VmRSS:") * 1024
+
+
+def held_bytes(maps: Iterable[ViewMaps], device: torch.device) -> int:
+    """Of view maps: what of them lies on the device."""
+    tensors = (getattr(level, name) for level in maps for name in ("color", "uv", "depth", "slot_map"))
+    return sum(tensor.nbytes for tensor in tensors if tensor.device == device)
+
+
+def available_memory(device: torch.device, allowed: int | None = None) -> int:
+    """Bytes that are still free for tensors on the device.
+
+    allowed: what this process may take altogether of a GPU that others use too. Of a CPU it is what the machine can
+    give without swapping, and no more than the container's limit leaves.
+    """
+    if device.type != "cuda":
+        return _available_on_host()
+    free, _ = torch.cuda.mem_get_info(device)
+    taken = torch.cuda.memory_allocated(device)
+    unused = torch.cuda.memory_reserved(device) - taken
+    return free + unused if allowed is None else max(0, min(free + unused, allowed - CONTEXT - taken))
+
+
+def limit_process(device: torch.device, allowed: int | None) -> None:
+    """Lets torch refuse what goes beyond `allowed` bytes of a GPU: a job's shortage is its own and no neighbor's."""
+    if device.type == "cuda" and allowed is not None:
+        total = torch.cuda.get_device_properties(device).total_memory
+        torch.cuda.set_per_process_memory_fraction(min(1.0, max(0, allowed - CONTEXT) / total), device)
+
+
+def _available_on_host() -> int:
+    found = [_meminfo("MemAvailable")]
+    for limit, usage, statistics in _CGROUPS:
+        try:
+            reclaimable = _field(statistics.read_text(), "inactive_file ")
+            found.append(int(limit.read_text()) - int(usage.read_text()) + reclaimable)
+        except (OSError, ValueError):  # there is no such limit, or it is "max"
+            continue
+    return max(0, min(found))
+
+
+_V2, _V1 = Path("/sys/fs/cgroup"), Path("/sys/fs/cgroup/memory")
+_CGROUPS = (
+    (_V2 / "memory.max", _V2 / "memory.current", _V2 / "memory.stat"),
+    (_V1 / "memory.limit_in_bytes", _V1 / "memory.usage_in_bytes", _V1 / "memory.stat"),
+)
+
+
+def _meminfo(name: str) -> int:
+    if sys.platform != "linux":
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
+    return _field(Path("/proc/meminfo").read_text(), f"{name}:") * 1024
+
+
+def _field(text: str, name: str) -> int:
+    return int(text.partition(name)[2].split()[0])
+
+
+def memory_problem(error: BaseException) -> str | None:
+    """What an error says if it is one of too little memory, None for any other.
+
+    torch's CPU allocator, cuBLAS and cuDNN, and mmap have no class of their own for it.
+    """
+    if isinstance(error, MemoryError | torch.OutOfMemoryError):
+        return str(error) or type(error).__name__
+    if isinstance(error, OSError) and error.errno == errno.ENOMEM:
+        return str(error)
+    said = str(error)
+    return said if isinstance(error, RuntimeError) and any(words in said for words in _SHORTAGES) else None
+
+
+_SHORTAGES = (
+    "can't allocate memory",
+    "not enough memory",
+    "out of memory",
+    "Cannot allocate memory",
+    "ALLOC_FAILED",
+    "std::bad_alloc",
+)

@@ -1,0 +1,62 @@
+"""The parts of a step that have a fast form for a GPU, behind one set of signatures; chosen once, at the start.
+
+The plain ones are torch and run everywhere. The fused ones are Triton's and need CUDA, the package `triton` and a C
+compiler, with which Triton builds its launchers.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from advtex_engine.batches import Batch, PairSampler
+from advtex_engine.examples import Examples, InputForm, assemble
+from advtex_engine.losses import mean_difference
+from advtex_engine.texture import sample_texels
+
+
+@dataclass(frozen=True)
+class Operations:
+    """name: "torch" or "triton". reason: why not the other one; None for the better one.
+
+    draw: `PairSampler.draw`. sample_texels: `texture.sample_texels`. assemble: `examples.assemble`. mean_difference:
+    `losses.mean_difference`. average(mean, state, weight): mean += weight * (state - mean), weight 0-dim on the device.
+    """
+
+    name: str
+    reason: str | None
+    draw: Callable[[PairSampler], Batch]
+    sample_texels: Callable[[Tensor, Tensor, Tensor], Tensor]
+    assemble: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor | None, InputForm], Examples]
+    mean_difference: Callable[[Tensor, Tensor], Tensor]
+    average: Callable[[Tensor, Tensor, Tensor], object]
+
+
+def plain_operations(reason: str | None = None) -> Operations:
+    return Operations("torch", reason, PairSampler.draw, sample_texels, assemble, mean_difference, torch.Tensor.lerp_)
+
+
+def choose_operations(device: torch.device) -> Operations:
+    """Triton's on a GPU that can have them, else the plain ones with the reason."""
+    if device.type != "cuda":
+        return plain_operations("the device is not an NVIDIA GPU")
+    if importlib.util.find_spec("triton") is None:
+        return plain_operations("the package triton is missing")
+    if shutil.which("gcc") is None and shutil.which("clang") is None:
+        return plain_operations("Triton needs a C compiler; install gcc")
+    try:
+        from advtex_engine.fused import triton_operations
+
+        fused = triton_operations()
+        # Whatever is amiss with compiler, driver or card shows in the first kernel, and had better do so here.
+        mean, state = torch.zeros(1, device=device), torch.ones(1, device=device)
+        fused.average(mean, state, torch.ones((), device=device))
+        found = float(mean)
+    except Exception as error:
+        return plain_operations(f"Triton failed: {error}")
+    return fused if found == 1.0 else plain_operations(f"Triton computes {found} where 1.0 is right")

@@ -18,6 +18,7 @@ from advtex_store.errors import QuotaExceeded, RecordNotFound
 from advtex_store.models import ApiKeyRow, JobRow, UploadRow
 
 SCOPES = ("read", "write")
+LONGEST_NAME = 255  # PostgreSQL insists on the width of a column, SQLite does not
 _KEY = re.compile(r"adv_([0-9a-f]{12})_([A-Za-z0-9]{40})")
 _ALPHABET = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789"
 
@@ -61,6 +62,8 @@ class Accounts:
         """Make a key; the only time that its secret can be seen. Without an owner, it is an owner of its own."""
         if unknown := set(scopes) - set(SCOPES):
             raise ValueError(f"unknown scope {sorted(unknown)}: the scopes are {', '.join(SCOPES)}")
+        if max(len(name), len(owner or "")) > LONGEST_NAME:
+            raise ValueError(f"the names of a key and of its owner have {LONGEST_NAME} characters at most")
         key_id = secrets.token_hex(6)
         secret = "".join(secrets.choice(_ALPHABET) for _ in range(40))
         with self.database.write() as session:
@@ -90,12 +93,7 @@ class Accounts:
             row = session.get(ApiKeyRow, key_id)
             stored = row.secret_sha256 if row is not None else "0" * 64
             matches = hmac.compare_digest(stored, digest)
-            if row is None or not matches or row.revoked_at is not None:
-                return None
-            if row.expires_at is not None and row.expires_at <= self.database.now(session):
-                return None
-            scopes = frozenset(row.scopes)
-            return Caller(row.id, row.owner, scopes, row.max_active_jobs, row.max_bytes, row.expires_at)
+            return caller_of(row, self.database.now(session)) if matches else None
 
     def rotate_key(self, key_id: str, keep_seconds: float = 0.0) -> str:
         """A new key with everything that the old one had; the old one works for `keep_seconds` more."""
@@ -147,12 +145,31 @@ class Accounts:
             row.revoked_at = row.revoked_at or self.database.now(session)
 
 
+def key_id(key: str) -> str:
+    """The part of a key that is no secret."""
+    return key.split("_")[1]
+
+
+def caller_of(row: ApiKeyRow | None, now: float) -> Caller | None:
+    """None for a key that is unknown, revoked or expired."""
+    if row is None or row.revoked_at is not None or (row.expires_at is not None and row.expires_at <= now):
+        return None
+    scopes = frozenset(row.scopes)
+    return Caller(row.id, row.owner, scopes, row.max_active_jobs, row.max_bytes, row.expires_at)
+
+
+def lock_owner(session: Session, owner: str) -> None:
+    """Until the transaction ends nobody else passes here for this owner: two requests at once cannot both take the
+    last place of a quota."""
+    query = select(ApiKeyRow.id).where(ApiKeyRow.owner == owner).order_by(ApiKeyRow.id)
+    session.scalars(query.with_for_update()).all()
+
+
 def check_active_jobs(session: Session, owner: str, most: int | None) -> None:
     """QuotaExceeded if one more job would be too many; inside the transaction that adds it."""
     if most is None:
         return
-    # The owner's keys are locked, so that two requests at once cannot both take the last place.
-    session.scalars(select(ApiKeyRow.id).where(ApiKeyRow.owner == owner).with_for_update()).all()
+    lock_owner(session, owner)
     active = _active_jobs(session, owner)
     if active >= most:
         raise QuotaExceeded(f"{active} jobs have not ended yet and this key may have {most}: wait, or cancel some")

@@ -355,7 +355,8 @@ class FolderBlobs(Blobs):
             missing.append(folder)
             folder = folder.parent
         for folder in reversed(missing):
-            folder.mkdir(exist_ok=True)
+            with suppress(FileExistsError):  # `exist_ok` would raise when the other's folder is gone at a second look
+                folder.mkdir()
             fsync_dir(folder.parent)
 
 

@@ -13,6 +13,7 @@ from alembic.config import Config
 from sqlalchemy import Connection, Engine, create_engine, event, text
 from sqlalchemy.engine import make_url
 from sqlalchemy.orm import Session
+from sqlalchemy.pool import ConnectionPoolEntry
 
 # A cut line is noticed in seconds, and what it left open is given up: rows that it had locked would block everybody.
 POSTGRES_LINE = {"connect_timeout": 5, "tcp_user_timeout": 10_000, "keepalives_idle": 10, "keepalives_interval": 5}
@@ -58,7 +59,8 @@ class Database:
         return float(session.execute(text("select extract(epoch from clock_timestamp())")).scalar_one())
 
     def close(self) -> None:
-        """Close the pooled connections."""
+        """Close the connections: those of the pool now, and those that a thread still uses when it lets go of them."""
+        event.listen(self.engine.pool, "checkin", _close_connection)
         self.engine.dispose()
 
 
@@ -74,6 +76,10 @@ def connect(url: str, limits: str = "") -> Engine:
     event.listen(engine, "connect", _prepare_sqlite)
     event.listen(engine, "begin", _begin_sqlite)
     return engine
+
+
+def _close_connection(_connection: Any, entry: ConnectionPoolEntry) -> None:
+    entry.close()  # of the pool: whoever asks it again gets a new connection
 
 
 def _prepare_sqlite(connection: Any, _record: Any) -> None:

@@ -2,6 +2,7 @@
 
     scans/{upload}/scan.zip
     jobs/{job}/checkpoints/{attempt}/...      stage caches and checkpoint of one attempt
+    jobs/{job}/live/{attempt}.json            what the texture looks like while the attempt makes it
     jobs/{job}/results/{attempt}/...          files that one attempt made
     jobs/{job}/result.json                    the manifest: written last, once, by the attempt that won
 
@@ -34,6 +35,15 @@ def checkpoints_prefix(job_id: str) -> str:
 
 def checkpoint_prefix(job_id: str, attempt: int) -> str:
     return f"jobs/{job_id}/checkpoints/{attempt}/"
+
+
+def live_prefix(job_id: str) -> str:
+    """Of all attempts."""
+    return f"jobs/{job_id}/live/"
+
+
+def live_key(job_id: str, attempt: int) -> str:
+    return f"jobs/{job_id}/live/{attempt}.json"
 
 
 def results_prefix(job_id: str) -> str:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from sqlalchemy import JSON, BigInteger, Double, ForeignKey, Index, String, Text
-from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, validates
+
+LOG_TAIL = 8000  # characters of a log that its row keeps
 
 
 class Base(DeclarativeBase):
@@ -30,6 +32,17 @@ class ApiKeyRow(Base):
     created_at: Mapped[float]
     expires_at: Mapped[float | None]
     revoked_at: Mapped[float | None]
+
+
+class SessionRow(Base):
+    """A browser that signed in with a key, and lasts no longer than it; or a link that signs one browser in, once."""
+
+    __tablename__ = "sessions"
+
+    token_sha256: Mapped[str] = mapped_column(primary_key=True)
+    key_id: Mapped[str] = mapped_column(ForeignKey("api_keys.id", ondelete="CASCADE"), index=True)
+    link: Mapped[bool] = mapped_column(default=False)
+    expires_at: Mapped[float] = mapped_column(index=True)
 
 
 class UploadRow(Base):
@@ -110,9 +123,15 @@ class JobRow(Base):
 
     __table_args__ = (
         Index("ix_jobs_owner_id", "owner", "id"),
+        Index("ix_jobs_owner_updated_at", "owner", "updated_at"),
         Index("ix_jobs_state_id", "state", "id"),
         Index("ix_jobs_owner_batch_id", "owner", "batch", "id"),
     )
+
+    @validates("log_tail")
+    def _shortened(self, _name: str, text: str) -> str:
+        """The newest of it. Libraries print what they like, and PostgreSQL's text has no NUL."""
+        return text[-LOG_TAIL:].replace("\0", "\ufffd")
 
 
 class EventRow(Base):

@@ -39,7 +39,10 @@ class Partial(ABC):
 
     @abstractmethod
     def flush(self) -> None:
-        """Everything before `offset` is durable from here on. The row is told before the next flush."""
+        """Everything before `offset` is durable from here on, and so is what was before the flush."""
+
+    def settle(self) -> None:  # noqa: B027  most have nothing to do
+        """The row tells of the last flush: what only an earlier offset needs may go."""
 
     @abstractmethod
     def publish(self) -> None:

@@ -81,7 +81,7 @@ class Claim:
     scan_key: str
     source: str | None
     options: JobOptions
-    stage_seconds: dict[str, float]  # of earlier attempts
+    progress: Progress  # of earlier attempts
     lease: Lease
 
 
@@ -116,7 +116,7 @@ class Records:
                 scan_key=keys.scan_key(row.upload_id),
                 source=row.source,
                 options=JobOptions.model_validate(row.options),
-                stage_seconds=row.progress.get("stage_seconds", {}),
+                progress=Progress.model_validate(row.progress),
                 lease=Lease(expires_at, row.cancel_requested),
             )
 
@@ -144,14 +144,14 @@ class Records:
             row.lease_expires_at = now + (lease_seconds or self.lease_seconds)
             row.reached = max(row.reached, reached)
             if log_tail is not None:
-                row.log_tail = log_tail[-8000:]
+                row.log_tail = log_tail
             if waiting_reason is not None and (reason := waiting_reason[:255]) != row.waiting_reason:
                 row.waiting_reason, row.updated_at, row.version = reason, now, row.version + 1
             if progress is not None and (data := progress.model_dump(mode="json")) != row.progress:
                 stage_changed = progress.stage != row.progress.get("stage")
                 row.progress, row.updated_at, row.version = data, now, row.version + 1
                 if stage_changed:
-                    _record(session, row, "progress", data)
+                    _record(session, row, "progress", {name: data[name] for name in data if name != "notes"})
             return Lease(row.lease_expires_at, row.cancel_requested)
 
     def succeed(
@@ -201,7 +201,7 @@ class Records:
             if expired_only and (row.lease_expires_at or 0.0) > self.database.now(session):
                 raise StaleAttempt(f"job {job_id}: the lease of attempt {attempt} still holds")
             if log_tail is not None:
-                row.log_tail = log_tail[-8000:]
+                row.log_tail = log_tail
             tally(session, ATTEMPTS, "lost")
             deaths = 1 if row.reached > row.reached_at_claim else row.deaths + 1
             if row.cancel_requested:
@@ -315,7 +315,7 @@ class Records:
             row = self._get(session, job_id, owner, lock=True)
             if JobState(row.state) not in TERMINAL:
                 raise IllegalTransition(f"job {job_id} is {row.state}: cancel it before deleting it")
-            row.deleted_at = self.database.now(session)
+            row.deleted_at = row.updated_at = self.database.now(session)
 
     # -- inside ---------------------------------------------------------------------------------------------------
 

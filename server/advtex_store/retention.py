@@ -73,7 +73,7 @@ class Retention:
             rows = session.scalars(query.limit(BATCH)).all()
         for row in rows:
             kept = {entry["key"] for entry in row.results}
-            for prefix in (keys.checkpoints_prefix(row.id), keys.results_prefix(row.id)):
+            for prefix in (keys.checkpoints_prefix(row.id), keys.live_prefix(row.id), keys.results_prefix(row.id)):
                 for info in list(self.blobs.list(prefix)):
                     if info.key not in kept:
                         self.blobs.delete(info.key)

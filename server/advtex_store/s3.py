@@ -37,6 +37,11 @@ class S3Blobs(Blobs):
             return False
         return True
 
+    def get(self, key: str) -> bytes:
+        """In one request: of a blob that is replaced meanwhile, either all or nothing is new."""
+        with _translated(key):
+            return bytes(obstore.get(self._store, check_key(key)).bytes())
+
     def stream(self, key: str, start: int = 0, end: int | None = None) -> Iterator[bytes]:
         size = self.head(key).size
         return self._ranges(key, start, size if end is None else min(end, size))

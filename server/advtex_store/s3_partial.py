@@ -1,7 +1,9 @@
 """Uploads that arrive in pieces, as multipart uploads of S3.
 
     {key}.multipart     the id of the multipart upload; created once
-    {key}.tail-{n}      what part n has so far: only the last part may be below 5 MiB, and a tail must be durable too
+    {key}.tail-{offset} what the part that is not full yet holds of the bytes before this offset: only the last part may
+                        be below 5 MiB, and its bytes must be durable too. A request that another one has taken over
+                        from may still write one; it never replaces the one that the row tells of
 
 All parts but the last have the same size, so that an offset says which part comes next and how much of it its tail
 holds. boto3, because obstore cannot go on with a multipart upload that another process began.
@@ -99,11 +101,10 @@ class S3Partial(Partial):
         self._size = size
         self._part = max(PART, math.ceil(size / MAX_PARTS))
         self._number, rest = divmod(offset, self._part)
-        self._buffer = bytearray(b"".join(blobs.stream(self._tail(self._number), 0, rest)) if rest else b"")
+        self._buffer = bytearray(blobs.get(self._tail(offset)) if rest else b"")
         if len(self._buffer) != rest:
             raise BlobNotFound(f"{key}: the first {offset} bytes are not held any more")
-        self._flushed = offset
-        self._tails = {self._number}
+        self._flushed = self._settled = offset
         self._upload_id = self._begun(offset)
 
     def write(self, data: bytes) -> None:
@@ -117,13 +118,14 @@ class S3Partial(Partial):
                 self._send()
 
     def flush(self) -> None:
-        for number in sorted(n for n in self._tails if n < self._flushed // self._part):
-            self._blobs.delete(self._tail(number))
-            self._tails.remove(number)
         if self._buffer and self.offset > self._flushed:
-            self._blobs.put(self._tail(self._number), bytes(self._buffer))
-            self._tails.add(self._number)
+            self._blobs.put(self._tail(self.offset), bytes(self._buffer))
         self._flushed = self.offset
+
+    def settle(self) -> None:
+        before, self._settled = self._settled, self._flushed
+        if before < self._settled and before % self._part:
+            self._blobs.delete(self._tail(before))
 
     def publish(self) -> None:
         try:
@@ -153,8 +155,8 @@ class S3Partial(Partial):
             self._multipart.abort(self._key, upload_id)
         return self._blobs.get(name).decode()
 
-    def _tail(self, number: int) -> str:
-        return f"{self._key}.tail-{number}"
+    def _tail(self, offset: int) -> str:
+        return f"{self._key}.tail-{offset}"
 
 
 @contextmanager

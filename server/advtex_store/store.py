@@ -8,10 +8,13 @@ from advtex_store.accounts import Accounts
 from advtex_store.batches import Batches
 from advtex_store.blobs import Blobs, open_blobs
 from advtex_store.database import Database
+from advtex_store.live import Live
+from advtex_store.overviews import Overviews
 from advtex_store.queue import JobQueue, connect_redis
 from advtex_store.records import Records
 from advtex_store.references import References
 from advtex_store.results import Results
+from advtex_store.sessions import Sessions
 from advtex_store.settings import StoreSettings
 from advtex_store.submissions import Submissions
 from advtex_store.tallies import Tallies
@@ -29,10 +32,13 @@ class Store:
     uploads: Uploads
     submissions: Submissions
     accounts: Accounts
+    sessions: Sessions
+    overviews: Overviews
     batches: Batches
     blobs: Blobs
     references: References
     results: Results
+    live: Live
     webhooks: Webhooks
     tallies: Tallies
     queue: JobQueue
@@ -56,10 +62,13 @@ def open_store(settings: StoreSettings) -> Store:
         uploads=Uploads(database, retention_seconds=retention),
         submissions=Submissions(database, retention_seconds=retention),
         accounts=Accounts(database),
+        sessions=Sessions(database),
+        overviews=Overviews(database),
         batches=Batches(database),
         blobs=blobs,
         references=References(settings.reference_roots.split()),
         results=Results(records, blobs),
+        live=Live(blobs),
         webhooks=Webhooks(database),
         tallies=Tallies(database),
         queue=JobQueue(connect_redis(settings)),

@@ -58,19 +58,17 @@ class Submissions:
         with self.database.write() as session:
             now = self.database.now(session)
             insert = sqlite.insert if session.get_bind().dialect.name == "sqlite" else postgresql.insert
-            session.execute(
-                insert(IdempotencyRow)
-                .values(
-                    owner=owner,
-                    token=token,
-                    body_sha256=body_sha256,
-                    holder=holder,
-                    held_until=now + HOLD_SECONDS,
-                    created_at=now,
-                )
-                .on_conflict_do_nothing()
+            inserted = insert(IdempotencyRow).values(
+                owner=owner,
+                token=token,
+                body_sha256=body_sha256,
+                holder=holder,
+                held_until=now + HOLD_SECONDS,
+                created_at=now,
             )
-            row = session.get_one(IdempotencyRow, (owner, token), with_for_update=True)
+            # An update of nothing: it locks the row that is there already, which its request may be about to release.
+            session.execute(inserted.on_conflict_do_update(index_elements=["owner", "token"], set_={"token": token}))
+            row = session.get_one(IdempotencyRow, (owner, token))
             if row.holder == holder:
                 return Reservation(owner, token, holder)
             if row.body_sha256 != body_sha256:

@@ -7,10 +7,11 @@ from collections.abc import Callable
 
 from sqlalchemy import ColumnElement, and_, exists, func, select, update
 
+from advtex_store.accounts import lock_owner
 from advtex_store.database import Database
 from advtex_store.errors import IllegalTransition, QuotaExceeded, RecordNotFound, Superseded
 from advtex_store.ids import new_id
-from advtex_store.models import ApiKeyRow, JobRow, UploadRow
+from advtex_store.models import JobRow, UploadRow
 
 INCOMPLETE_SECONDS = 86400.0  # an upload is forgotten this long after its last bytes
 FOUND = 20  # of the uploads with the same bytes, the most useful ones
@@ -39,8 +40,7 @@ class Uploads:
         admit: called with the bytes that unfinished uploads still expect, all owners' together; refuses by raising.
         """
         with self.database.write() as session:
-            # The owner's keys are locked, so that two requests at once cannot both take the last bytes.
-            session.scalars(select(ApiKeyRow.id).where(ApiKeyRow.owner == owner).with_for_update()).all()
+            lock_owner(session, owner)
             held = session.scalar(
                 select(func.sum(UploadRow.size)).where(UploadRow.owner == owner, UploadRow.deleted_at.is_(None))
             )

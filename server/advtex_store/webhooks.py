@@ -13,6 +13,7 @@ from sqlalchemy.orm import Session
 
 from advtex_contract.jobs import JobState
 from advtex_contract.webhooks import JobEvent, JobEventData, JobEventError
+from advtex_store.accounts import lock_owner
 from advtex_store.database import Database
 from advtex_store.errors import QuotaExceeded, RecordNotFound
 from advtex_store.ids import new_id
@@ -45,6 +46,7 @@ class Webhooks:
     def create(self, owner: str, url: str, events: Collection[JobState]) -> WebhookRow:
         """A webhook with a secret of its own. QuotaExceeded: the owner has as many as one may have."""
         with self.database.write() as session:
+            lock_owner(session, owner)
             count = session.scalar(select(func.count()).where(WebhookRow.owner == owner)) or 0
             if count >= MOST_PER_OWNER:
                 raise QuotaExceeded(f"there are {count} webhooks already: delete one")
@@ -120,8 +122,9 @@ class Webhooks:
     def delivered(self, delivery: Delivery) -> None:
         """The receiver has it."""
         with self.database.write() as session:
-            session.execute(delete(DeliveryRow).where(DeliveryRow.id == delivery.id))
+            # The webhook is locked before its deliveries, as everywhere: two servers may try two of them at once.
             hook = session.get(WebhookRow, delivery.webhook_id, with_for_update=True)
+            session.execute(delete(DeliveryRow).where(DeliveryRow.id == delivery.id))
             if hook is not None and hook.failures:
                 hook.failures, hook.last_error = 0, ""
                 _resume(session, hook.id, self.database.now(session))
@@ -159,7 +162,9 @@ class Webhooks:
 
 def tell_webhooks(session: Session, row: JobRow, at: float) -> None:
     """Put the job's new state into the outbox of everyone who wants to know; inside the transaction that changes it."""
-    for hook in session.scalars(select(WebhookRow).where(WebhookRow.owner == row.owner)):
+    hooks = select(WebhookRow).where(WebhookRow.owner == row.owner)
+    # None of them can be deleted now, which would undo the change that is to be told.
+    for hook in session.scalars(hooks.with_for_update(read=True, key_share=True)):
         if row.state not in hook.events:
             continue
         resumes = None

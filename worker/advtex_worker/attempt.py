@@ -33,6 +33,8 @@ from advtex_worker.events import (
     DiskFullEvent,
     FailedEvent,
     FinishedEvent,
+    LiveEvent,
+    NoteEvent,
     ProgressEvent,
     Request,
     StageEvent,
@@ -40,6 +42,7 @@ from advtex_worker.events import (
     WarningEvent,
 )
 from advtex_worker.lease import Ending, LeaseKeeper
+from advtex_worker.live import LivePoster
 from advtex_worker.progress import ProgressTracker
 from advtex_worker.settings import WorkerSettings
 
@@ -183,12 +186,14 @@ class Attempt:
         self._warnings = base.warnings
         self._log.info("attempt begins", resumed_files=len(base.files))
         uploader = CheckpointUploader(self._store.blobs, self._job_id, self._number, base, self._keeper.beat)
+        poster = LivePoster(self._store.live, self._job_id, self._number, self._keeper.beat)
         ended: FinishedEvent | FailedEvent | StoppedEvent | None = None
         try:
             with self._spawn(resume=bool(base.files)) as child:
                 self._child = child
-                ended = self._listen(child, uploader)
+                ended = self._listen(child, uploader, poster)
         finally:
+            poster.stop()
             for killer in self._killers:
                 killer.cancel()
             if self._keeper.ending is Ending.lost or isinstance(ended, FinishedEvent):
@@ -222,17 +227,22 @@ class Attempt:
             snapshots=space.snapshots,
             resume=resume,
             options=self._claim.options,
-            device=self._settings.device,
+            # A runner of a slot sees the slot's GPU alone.
+            device=self._settings.device if self._settings.gpu is None else "cuda",
+            jobs_per_gpu=self._settings.jobs_per_gpu,
+            memory_bytes=self._settings.memory_bytes,
         )
-        child = Child(request, space.log, self._settings.threads)
+        child = Child(request, space.log, self._settings.threads, self._settings.gpu)
         self._log.info("runner started", pid=child.pid)
         return child
 
-    def _listen(self, child: Child, uploader: CheckpointUploader) -> FinishedEvent | FailedEvent | StoppedEvent | None:
+    def _listen(
+        self, child: Child, uploader: CheckpointUploader, poster: LivePoster
+    ) -> FinishedEvent | FailedEvent | StoppedEvent | None:
         """Everything the runner says, in order. -> how it said that it ended, None if it died."""
         if self._keeper.ending:  # asked before there was anybody to ask
             self._on_ending(Ending.cancel if self._canceled else self._keeper.ending)
-        tracker = ProgressTracker(self._claim.stage_seconds)
+        tracker = ProgressTracker(self._claim.progress)
         for event in child.events():
             match event:
                 case StageEvent():
@@ -242,6 +252,10 @@ class Attempt:
                 case WarningEvent():
                     if event.problem not in self._warnings:  # a stage that is done again warns again
                         self._warnings += (event.problem,)
+                case NoteEvent():
+                    tracker.note(event)
+                case LiveEvent():
+                    poster.post(event.record)
                 case CheckpointEvent():
                     uploader.add(event.files, self._warnings)
                 case DiskFullEvent():
@@ -264,6 +278,7 @@ class Attempt:
             self._transfer(lambda: self._store.results.commit(job_id, number, self._space.results(), self._warnings))
             with suppress(Exception):  # they are only worth their space now; deleting the job removes them too
                 self._store.blobs.delete_prefix(keys.checkpoints_prefix(job_id))
+                self._store.blobs.delete_prefix(keys.live_prefix(job_id))
         elif isinstance(ended, FailedEvent) and ended.code == "invalid_scan":
             rejection = JobError(code=ended.code, message=ended.message, details=ended.details)
             self._record(lambda: records.reject(job_id, number, rejection))

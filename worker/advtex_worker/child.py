@@ -29,16 +29,19 @@ class Child:
     """A running runner, and a context manager that outlasts it.
 
     Made on a thread that lives as long as the child is wanted (`parentage.py`).
-    returncode: of the process once the block has ended, negative for a signal.
+    gpu: UUID of the only one that it sees; None for all. returncode: of the process once the block has ended, negative
+    for a signal.
     """
 
-    def __init__(self, request: Request, log: Path, threads: int) -> None:
+    def __init__(self, request: Request, log: Path, threads: int, gpu: str | None = None) -> None:
         self._log = log
         self._lock = threading.Lock()
         self.returncode = 0
         environment = child_environment(os.environ)
         for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
             environment[name] = str(threads)
+        if gpu is not None:
+            environment["CUDA_VISIBLE_DEVICES"] = gpu
         with log.open("ab") as sink:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "advtex_worker.runner", str(os.getpid())],

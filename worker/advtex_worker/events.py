@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from advtex_contract.errors import ErrorDetail
+from advtex_contract.live import LiveRecord
 from advtex_contract.options import JobOptions
 
 STOP_LINE = "stop\n"
@@ -31,6 +32,7 @@ class Request(_Message):
     """What to run. `engine` is `module:function` with the signature of `advtex_engine.pipeline.texture_scan`.
 
     snapshots: where reported checkpoint files are kept until the parent has taken them; beside `work`.
+    jobs_per_gpu: how many may run on the device at a time. memory_bytes: what this one may take of a GPU.
     """
 
     engine: str
@@ -41,14 +43,18 @@ class Request(_Message):
     resume: bool
     options: JobOptions
     device: str
+    jobs_per_gpu: int = 1
+    memory_bytes: int | None = None
 
 
 class StageEvent(_Message):
-    """A stage began, or ended if `seconds` is set."""
+    """A stage began, or ended if `seconds` is set; then the peaks of its memory are known too."""
 
     kind: Literal["stage"] = "stage"
     stage: str
     seconds: float | None = None
+    peak_bytes: int | None = None
+    device_peak_bytes: int | None = None
 
 
 class ProgressEvent(_Message):
@@ -61,6 +67,20 @@ class ProgressEvent(_Message):
 class WarningEvent(_Message):
     kind: Literal["warning"] = "warning"
     problem: ErrorDetail
+
+
+class NoteEvent(_Message):
+    """Something that a user may like to know."""
+
+    kind: Literal["note"] = "note"
+    message: str
+
+
+class LiveEvent(_Message):
+    """What the texture looks like now."""
+
+    kind: Literal["live"] = "live"
+    record: LiveRecord
 
 
 class CheckpointEvent(_Message):
@@ -98,7 +118,7 @@ class StoppedEvent(_Message):
 
 
 Ending = FinishedEvent | FailedEvent | StoppedEvent
-Event = StageEvent | ProgressEvent | WarningEvent | CheckpointEvent | DiskFullEvent | Ending
+Event = StageEvent | ProgressEvent | WarningEvent | NoteEvent | LiveEvent | CheckpointEvent | DiskFullEvent | Ending
 _EVENT: TypeAdapter[Event] = TypeAdapter(Annotated[Event, Field(discriminator="kind")])
 
 

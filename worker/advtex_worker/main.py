@@ -1,4 +1,7 @@
-"""`advtex-worker`: takes jobs from the queue, one at a time, until it is told to go. Settings come from `ADVTEX_*`."""
+"""`advtex-worker`: takes jobs from the queue until it is told to go, one at a time or as many as its GPUs can have.
+
+Settings come from `ADVTEX_*`.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,9 @@ import signal
 import socket
 import sys
 import threading
+import time
+from collections.abc import Sequence
+from dataclasses import replace
 from types import FrameType
 from typing import Any
 
@@ -21,9 +27,9 @@ from rq.serializers import JSONSerializer
 
 from advtex_store.logs import configure_logs
 from advtex_store.queue import JobQueue, attempt_of, class_of, connect_redis, queue_name
-from advtex_worker.memory import usable_memory
 from advtex_worker.parentage import die_with_parent
 from advtex_worker.settings import WorkerSettings
+from advtex_worker.slots import Slot, find_slots, hold, settings_of, supervise
 from advtex_worker.tasks import Host, serve_as
 
 RECONNECT_SECONDS = 2
@@ -112,11 +118,23 @@ class JobWorker(Worker):
             log.warning("Redis is away; the running job is not affected", error=str(error))
 
 
-def work(host: Host) -> None:
-    """Serve the queue until SIGTERM or SIGINT; a Redis that is away is waited for."""
+def serve(host: Host, command: Sequence[str]) -> None:
+    """Serve the queue with all slots until SIGTERM or SIGINT. A single one is served here; of several each gets a
+    process, started by `command`."""
+    slots = find_slots(host.settings)
+    if len(slots) > 1:
+        log.info("worker begins slots", slots=len(slots))
+        supervise(command, slots, host.settings)
+    else:
+        work(replace(host, settings=settings_of(slots[0], host.settings, 1)), slots[0])
+
+
+def work(host: Host, slot: Slot) -> None:
+    """Serve the queue until SIGTERM or SIGINT; a Redis that is away is waited for, and so is a slot of a GPU."""
     stopping = threading.Event()
-    gib = class_of(host.settings.memory_bytes or usable_memory(host.settings.device))
-    log.info("worker takes jobs", memory_gib=gib)
+    gib = class_of(slot.memory_bytes)
+    _lock = hold(slot, host.settings.jobs_per_gpu, time.sleep)
+    log.info("worker takes jobs", memory_gib=gib, gpu=slot.gpu)
     while not stopping.is_set():
         try:
             JobWorker(host, connect_redis(host.settings), stopping, gib).work(logging_level="WARNING")
@@ -138,7 +156,7 @@ def main() -> None:
         sys.exit(f"advtex-worker: the configuration is wrong: {error}")
     configure_logs(logging.getLevelNamesMapping()[settings.log_level])
     log.info("worker begins", device=settings.device, threads=settings.threads)
-    work(Host(settings))
+    serve(Host(settings), [sys.executable, "-m", "advtex_worker.main"])
     log.info("worker ends")
 
 

@@ -1,27 +1,52 @@
-"""How much memory jobs may use on this worker, found without torch."""
+"""Which GPUs this worker may use, and how much memory jobs may use on it, found without torch."""
 
 from __future__ import annotations
 
 import os
 import subprocess
+from dataclasses import dataclass
 from pathlib import Path
 
 CGROUP_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
-QUERY = ["nvidia-smi", "--query-gpu=memory.total", "--format=csv,noheader,nounits"]
+QUERY = ["nvidia-smi", "--query-gpu=uuid,memory.total", "--format=csv,noheader,nounits"]
+VISIBLE = "CUDA_VISIBLE_DEVICES"
 
 
-def usable_memory(device: str) -> int:
-    """Bytes: of the smallest GPU, since a job may run on any of them, or of the machine (or container) without one."""
-    gpus = [] if device == "cpu" else _gpu_memory()
-    return min(gpus) if gpus else _machine_memory()
+@dataclass(frozen=True)
+class Gpu:
+    """uuid: as nvidia-smi names it and CUDA_VISIBLE_DEVICES takes it."""
+
+    uuid: str
+    memory_bytes: int
 
 
-def _gpu_memory() -> list[int]:
+def list_gpus() -> list[Gpu]:
+    """The GPUs that this process may see, in the order of CUDA_VISIBLE_DEVICES or else of nvidia-smi.
+
+    Numbers in that variable are taken for nvidia-smi's. Parts of a GPU (MIG) are not found.
+    """
     try:
         told = subprocess.run(QUERY, capture_output=True, text=True, timeout=30, check=True).stdout
     except (OSError, subprocess.SubprocessError):  # no driver, so no GPU
         return []
-    return [int(mebibytes) << 20 for mebibytes in told.split() if mebibytes.isdigit()]
+    rows = [line.split(",") for line in told.splitlines()]
+    there = [Gpu(row[0].strip(), int(row[1]) << 20) for row in rows if len(row) == 2 and row[1].strip().isdigit()]
+    visible = os.environ.get(VISIBLE)
+    if visible is None:
+        return there
+    found = []
+    for name in filter(None, map(str.strip, visible.split(","))):
+        matching = there[int(name) : int(name) + 1] if name.isdigit() else [g for g in there if g.uuid.startswith(name)]
+        if not matching:  # CUDA takes those before the first that it does not know
+            break
+        found += matching[:1]
+    return found
+
+
+def usable_memory(device: str) -> int:
+    """Bytes: of the smallest GPU, since a job may run on any of them, or of the machine (or container) without one."""
+    gpus = [] if device == "cpu" else list_gpus()
+    return min(gpu.memory_bytes for gpu in gpus) if gpus else _machine_memory()
 
 
 def _machine_memory() -> int:

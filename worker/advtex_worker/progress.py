@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 from advtex_contract.jobs import Progress
 from advtex_engine.monitor import STAGES
-from advtex_worker.events import ProgressEvent, StageEvent
+from advtex_worker.events import NoteEvent, ProgressEvent, StageEvent
 
+NOTES, NOTE_LENGTH = 50, 500
 STAGE_WEIGHT = 10_000_000  # more than any step count
 
 
 class ProgressTracker:
     """Folds stage and progress events into one view. Not thread-safe: views are immutable and handed over whole.
 
-    earlier: seconds that the attempts before spent in stages; what this one spends is added.
+    earlier: how far the attempts before came; of it the seconds that they spent in stages, to which this one's are
+    added, their peaks of memory and their notes count on.
     """
 
-    def __init__(self, earlier: Mapping[str, float], clock: Callable[[], float] = time.monotonic) -> None:
-        self.view = Progress(stage_seconds=dict(earlier))
+    def __init__(self, earlier: Progress, clock: Callable[[], float] = time.monotonic) -> None:
+        kept = {"stage_seconds", "stage_peak_bytes", "stage_device_peak_bytes", "notes"}
+        self.view = Progress(**earlier.model_dump(include=kept))
         self.reached = 0
         self._clock = clock
         self._first: tuple[int, float] | None = None
@@ -28,7 +31,7 @@ class ProgressTracker:
 
     def stage(self, event: StageEvent) -> None:
         if event.seconds is not None:
-            self.view = self.view.model_copy(update={"stage_seconds": self._spent(event.stage, event.seconds)})
+            self.view = self.view.model_copy(update=self._ended(event, event.seconds))
             return
         self._before, self._began = self.view.stage_seconds.get(event.stage, 0.0), self._clock()
         self._first = None
@@ -53,6 +56,22 @@ class ProgressTracker:
         }
         self.view = self.view.model_copy(update=update)
         self._reach(self.view.stage, event.step)
+
+    def note(self, event: NoteEvent) -> None:
+        """A stage that is done again says the same again."""
+        message = event.message[:NOTE_LENGTH]
+        if message not in self.view.notes:
+            self.view = self.view.model_copy(update={"notes": [*self.view.notes, message][-NOTES:]})
+
+    def _ended(self, event: StageEvent, seconds: float) -> dict[str, object]:
+        update: dict[str, object] = {"stage_seconds": self._spent(event.stage, seconds)}
+        if event.peak_bytes is not None:
+            update["stage_peak_bytes"] = self.view.stage_peak_bytes | {event.stage: event.peak_bytes}
+        if event.device_peak_bytes is not None:
+            update["stage_device_peak_bytes"] = self.view.stage_device_peak_bytes | {
+                event.stage: event.device_peak_bytes
+            }
+        return update
 
     def _spent(self, stage: str, seconds: float) -> dict[str, float]:
         return self.view.stage_seconds | {stage: round(self._before + seconds, 3)}

@@ -16,12 +16,16 @@ import threading
 import time
 import traceback
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any, Never
 
+from pydantic import ValidationError
+
 from advtex_contract.errors import ErrorDetail
-from advtex_engine.errors import EngineError, OptionError, Problem, ScanError, Stopped
-from advtex_engine.monitor import Monitor
+from advtex_contract.live import LiveRecord
+from advtex_engine.errors import EngineError, MemoryShortage, OptionError, Problem, ScanError, Stopped
+from advtex_engine.monitor import Glimpse, Monitor
 from advtex_worker.adapt import texture_config
 from advtex_worker.events import (
     CANCEL_LINE,
@@ -33,6 +37,8 @@ from advtex_worker.events import (
     Event,
     FailedEvent,
     FinishedEvent,
+    LiveEvent,
+    NoteEvent,
     ProgressEvent,
     Request,
     StageEvent,
@@ -42,6 +48,7 @@ from advtex_worker.events import (
 from advtex_worker.parentage import die_with_parent
 
 ENGINE = "advtex_engine.pipeline:texture_scan"
+VIEW_NAME = 200  # characters of a frame's name that are shown
 DISK_SECONDS = 2.0  # between two looks whether a full disk has room again
 
 
@@ -70,8 +77,11 @@ class Reporter(Monitor):
     def stage_started(self, stage: str) -> None:
         self.tell(StageEvent(stage=stage))
 
-    def stage_finished(self, stage: str, seconds: float, _peak_memory_bytes: int) -> None:
-        self.tell(StageEvent(stage=stage, seconds=seconds))
+    def stage_finished(
+        self, stage: str, seconds: float, peak_memory_bytes: int, peak_device_memory_bytes: int | None
+    ) -> None:
+        peak, on_device = peak_memory_bytes, peak_device_memory_bytes
+        self.tell(StageEvent(stage=stage, seconds=seconds, peak_bytes=peak, device_peak_bytes=on_device))
 
     def progress(self, step: int, steps: int, losses: Mapping[str, float]) -> None:
         finite = {name: value for name, value in losses.items() if math.isfinite(value)}  # JSON has no others
@@ -79,6 +89,19 @@ class Reporter(Monitor):
 
     def warning(self, problem: Problem) -> None:
         self.tell(WarningEvent(problem=_detail(problem, "warning")))
+
+    def note(self, message: str) -> None:
+        self.tell(NoteEvent(message=message))
+
+    def glimpsed(self, glimpse: Glimpse) -> None:
+        """One that breaks the bounds of the contract is left out: a job does not fail for it."""
+        pictures = [
+            {"name": name, "view": glimpse.titles[name][:VIEW_NAME], "jpeg": jpeg}
+            for name, jpeg in glimpse.pictures.items()
+        ]
+        record = {"step": glimpse.step, "curves": glimpse.curves, "pictures": pictures}
+        with suppress(ValidationError):
+            self.tell(LiveEvent(record=LiveRecord.model_validate(record)))
 
     def checkpointed(self, files: tuple[Path, ...]) -> None:
         """The engine replaces files and never changes them, so a hard link keeps this state at no cost."""
@@ -115,11 +138,11 @@ def _run_once(request: Request, reporter: Reporter) -> Ending | None:
     try:
         texture_scan = _resolved(request.engine)
         texture_config(request.options, "cpu")  # options are refused before a device is waited for
-        device, _lock = _device(request.device, reporter)
+        device, _lock = _device(request, reporter)
         texture_scan(
             request.scan,
             request.out,
-            texture_config(request.options, device),
+            texture_config(request.options, device, request.memory_bytes),
             work=request.work,
             resume=request.resume,
             monitor=reporter,
@@ -131,6 +154,9 @@ def _run_once(request: Request, reporter: Reporter) -> Ending | None:
         return FailedEvent(code="invalid_scan", message=str(error), details=problems)
     except OptionError as error:
         return FailedEvent(code="invalid_options", message=str(error))
+    except MemoryShortage as error:
+        traceback.print_exc()
+        return FailedEvent(code="out_of_memory", message=str(error))
     except EngineError as error:
         traceback.print_exc()
         return FailedEvent(code="engine_error", message=str(error))
@@ -150,13 +176,13 @@ def _resolved(engine: str) -> Any:
     return getattr(importlib.import_module(module), function)
 
 
-def _device(wanted: str, reporter: Reporter) -> tuple[str, object]:
+def _device(request: Request, reporter: Reporter) -> tuple[str, object]:
     """The device and its lock, which must be kept while the engine runs."""
-    if wanted == "cpu":
+    if request.device == "cpu":
         return "cpu", None
     from advtex_worker import devices  # torch is imported by the process that needs it, and only then
 
-    taken = devices.acquire(wanted, reporter.stop_requested)
+    taken = devices.acquire(request.device, reporter.stop_requested, request.jobs_per_gpu)
     if taken is None:
         raise Stopped
     return taken

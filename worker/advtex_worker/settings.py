@@ -14,9 +14,13 @@ class WorkerSettings(StoreSettings):
     """Settings of one worker.
 
     work_dir: scratch space of running attempts, `<data_dir>/work` by default.
+    gpu: set for the processes that a worker starts for each of its GPUs; set by hand, this process takes one job at a
+    time, on that GPU. GPUs in `device` have nvidia-smi's numbers.
     """
 
     device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="where the engine computes")
+    gpu: str | None = Field(default=None, description="UUID, as nvidia-smi names it, of the only GPU to use")
+    jobs_per_gpu: int = Field(default=1, ge=1, le=64, description="at a time; they share its memory evenly")
     memory_bytes: int | None = Field(default=None, gt=0, description="what a job may use; the device's by default")
     work_dir: Path | None = None
     threads: int = Field(default_factory=lambda: len(os.sched_getaffinity(0)), ge=1, description="of the engine")

@@ -1,0 +1,151 @@
+"""Slots: a place for one job at a time on a GPU. A worker has as many as its GPUs can have jobs.
+
+Each slot has a process with an RQ worker of its own, which is told by `ADVTEX_GPU` which GPU its jobs see. It holds a
+lock for as long as it lives, so that of all workers of a machine no more take jobs than its GPUs can have; the others
+wait without a job, and step in when one goes.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import FrameType
+from typing import IO
+
+import structlog
+
+from advtex_worker.locks import first_lock, lock_paths
+from advtex_worker.memory import list_gpus, usable_memory
+from advtex_worker.parentage import die_with_parent
+from advtex_worker.settings import WorkerSettings
+
+POLL_SECONDS = 0.2
+RESTART_SECONDS = (1.0, 2.0, 5.0, 10.0, 30.0)  # pauses before further starts of a slot that keeps dying
+STEADY_SECONDS = 60.0  # one that lived this long starts again at the shortest pause
+
+log = structlog.get_logger()
+
+
+@dataclass(frozen=True)
+class Slot:
+    """gpu: UUID, None where the runner finds its device itself. memory_bytes: what a job may use."""
+
+    gpu: str | None
+    memory_bytes: int
+
+
+def find_slots(settings: WorkerSettings) -> list[Slot]:
+    """All slots that the settings give this machine, or the one of a process that was started for it; at least one.
+
+    A GPU's memory is shared out evenly among its slots.
+    """
+    gpus = [] if settings.device == "cpu" else list_gpus()
+    if settings.gpu is not None:
+        gpus = [gpu for gpu in gpus if gpu.uuid == settings.gpu]
+    elif ":" in settings.device:
+        number = int(settings.device.partition(":")[2])
+        gpus = gpus[number : number + 1]
+    elif settings.device == "cuda":
+        gpus = gpus[:1]
+    if not gpus:
+        return [Slot(settings.gpu, settings.memory_bytes or usable_memory(settings.device))]
+    jobs = settings.jobs_per_gpu
+    slots = [Slot(gpu.uuid, settings.memory_bytes or gpu.memory_bytes // jobs) for gpu in gpus]
+    return slots if settings.gpu is not None else [slot for _ in range(jobs) for slot in slots]
+
+
+def settings_of(slot: Slot, settings: WorkerSettings, slots: int) -> WorkerSettings:
+    """For the one slot of a process: its GPU, its share of memory, and of the threads if nobody has set them."""
+    changed: dict[str, object] = {"gpu": slot.gpu}
+    if settings.jobs_per_gpu > 1 and slot.gpu is not None:
+        changed["memory_bytes"] = slot.memory_bytes
+    if "threads" not in settings.model_fields_set:
+        changed["threads"] = max(1, settings.threads // slots)
+    return settings.model_copy(update=changed)
+
+
+def hold(slot: Slot, jobs: int, wait: Callable[[float], object]) -> IO[bytes] | None:
+    """The lock of a slot on its GPU, waited for; None for one that has no GPU of its own."""
+    if slot.gpu is None:
+        return None
+    told = False
+    while (lock := first_lock(lock_paths(f"slot-{slot.gpu}", jobs))) is None:
+        if not told:
+            log.info("all slots of the GPU are taken by other workers; waiting", gpu=slot.gpu)
+            told = True
+        wait(POLL_SECONDS)
+    return lock
+
+
+def supervise(command: Sequence[str], slots: Sequence[Slot], settings: WorkerSettings) -> None:
+    """One process per slot, started again when it dies, until SIGTERM or SIGINT; each then gives its job back."""
+    keepers = [_Keeper(command, _environment(settings_of(slot, settings, len(slots)))) for slot in slots]
+    stopping = False
+
+    def stop(_signum: int, _frame: FrameType | None) -> None:
+        nonlocal stopping
+        stopping = True
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, stop)
+    while not stopping:
+        for keeper in keepers:
+            keeper.watch()
+        time.sleep(POLL_SECONDS)
+    for keeper in keepers:
+        keeper.ask_to_stop()
+    for keeper in keepers:
+        keeper.wait()
+
+
+def _environment(settings: WorkerSettings) -> dict[str, str]:
+    told = {"ADVTEX_GPU": settings.gpu or "", "ADVTEX_THREADS": str(settings.threads)}
+    if settings.memory_bytes is not None:
+        told["ADVTEX_MEMORY_BYTES"] = str(settings.memory_bytes)
+    return told
+
+
+class _Keeper:
+    """A slot's process. Made and watched on the main thread, which lives as long as the process is wanted."""
+
+    def __init__(self, command: Sequence[str], environment: Mapping[str, str]) -> None:
+        self._command, self._environment = command, environment
+        self._process: subprocess.Popen[bytes] | None = None
+        self._started = self._next_start = 0.0
+        self._failures = 0
+
+    def watch(self) -> None:
+        now = time.monotonic()
+        if self._process is not None:
+            if self._process.poll() is None:
+                return
+            self._failures = 0 if now - self._started > STEADY_SECONDS else self._failures + 1
+            pause = RESTART_SECONDS[min(max(self._failures, 1), len(RESTART_SECONDS)) - 1]
+            log.warning("a slot's process died, starts again", exit_code=self._process.returncode, pause=pause)
+            self._process, self._next_start = None, now + pause
+        if now >= self._next_start:
+            self._start()
+
+    def ask_to_stop(self) -> None:
+        if self._process is not None and self._process.poll() is None:
+            self._process.send_signal(signal.SIGTERM)
+
+    def wait(self) -> None:
+        if self._process is not None:
+            self._process.wait()
+
+    def _start(self) -> None:
+        parent = os.getpid()
+        self._process = subprocess.Popen(
+            self._command,
+            env=os.environ | self._environment,
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,  # a Ctrl-C reaches the supervisor alone, which asks each process once
+            preexec_fn=lambda: die_with_parent(parent, signal.SIGTERM),
+        )
+        self._started = time.monotonic()
+        log.info("slot started", pid=self._process.pid, gpu=self._environment["ADVTEX_GPU"])

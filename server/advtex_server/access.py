@@ -1,24 +1,31 @@
-"""Who may pass: the key is checked before a single byte of a body is read, and bodies that are no uploads are small."""
+"""Who may pass: the key or the browser's session is checked before a single byte of a body is read, and bodies that are
+no uploads are small."""
 
 from __future__ import annotations
 
+import functools
+
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
+from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from advtex_server.browsers import Guests, session_token
 from advtex_server.doorkeeper import Doorkeeper
 from advtex_server.errors import respond
+from advtex_store.accounts import Caller
 
 API = "/v1/"
 UPLOADS = "/v1/uploads"
 
 
 class AccessMiddleware:
-    """Sets `scope["state"]["caller"]` for everything below `/v1/`."""
+    """Sets `scope["state"]["caller"]`, and `ask_caller` that finds out again, for everything below `/v1/`."""
 
-    def __init__(self, app: ASGIApp, doorkeeper: Doorkeeper, max_body_bytes: int) -> None:
+    def __init__(self, app: ASGIApp, doorkeeper: Doorkeeper, guests: Guests, max_body_bytes: int) -> None:
         self.app = app
         self.doorkeeper = doorkeeper
+        self.guests = guests
         self.max_body_bytes = max_body_bytes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -28,15 +35,20 @@ class AccessMiddleware:
         headers = Headers(scope=scope)
         try:
             if scope["path"].startswith(API):
-                scope.setdefault("state", {})["caller"] = await self.doorkeeper.caller(
-                    headers.get("authorization", ""), scope["client"][0] if scope.get("client") else ""
-                )
+                ask = functools.partial(self._caller, HTTPConnection(scope))
+                scope.setdefault("state", {}).update(caller=await ask(), ask_caller=ask)
             if not scope["path"].startswith(UPLOADS):
                 receive = self._limited(headers, receive)
         except Exception as error:
             await respond(scope, error)(scope, receive, send)
             return
         await self.app(scope, receive, send)
+
+    async def _caller(self, connection: HTTPConnection) -> Caller:
+        authorization = connection.headers.get("authorization", "")
+        if not authorization and session_token(connection):
+            return await self.guests.caller(connection)
+        return await self.doorkeeper.caller(authorization, connection.client.host if connection.client else "")
 
     def _limited(self, headers: Headers, receive: Receive) -> Receive:
         # An HTTPException, because FastAPI turns all others that come up while a body is read into a plain 400.

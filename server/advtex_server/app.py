@@ -12,6 +12,7 @@ from fastapi import FastAPI
 from advtex_server import errors
 from advtex_server.access import AccessMiddleware
 from advtex_server.bodies import OpenBodies
+from advtex_server.browsers import BrowserHeadersMiddleware, Guests
 from advtex_server.deliveries import Deliverer
 from advtex_server.dispatch import Dispatcher
 from advtex_server.doorkeeper import Doorkeeper
@@ -19,7 +20,7 @@ from advtex_server.events import Lookout
 from advtex_server.intake import Intake
 from advtex_server.metrics import Metrics, MetricsMiddleware
 from advtex_server.refusal import ANYWHERE
-from advtex_server.routes import batches, health, jobs, uploads, webhooks
+from advtex_server.routes import batches, health, jobs, pages, uploads, webhooks
 from advtex_server.service import Service
 from advtex_server.settings import ServerSettings
 from advtex_server.tus import TusMiddleware
@@ -68,10 +69,13 @@ def create_app(settings: ServerSettings) -> FastAPI:
     app.state.lookout = Lookout(app.state.service)
     errors.install(app)
     doorkeeper = Doorkeeper(store.accounts, settings.auth_failures_per_minute)
-    app.add_middleware(AccessMiddleware, doorkeeper=doorkeeper, max_body_bytes=settings.max_body_bytes)
+    guests = Guests(store.sessions)
+    app.state.doorkeeper, app.state.guests = doorkeeper, guests
+    app.add_middleware(AccessMiddleware, doorkeeper=doorkeeper, guests=guests, max_body_bytes=settings.max_body_bytes)
     app.add_middleware(TusMiddleware)
     app.add_middleware(MetricsMiddleware, metrics=metrics)
-    for module in (webhooks, uploads, jobs, batches, health):
+    app.add_middleware(BrowserHeadersMiddleware)
+    for module in (webhooks, uploads, jobs, batches, health, pages):
         app.include_router(module.router)
     return app
 

@@ -39,7 +39,7 @@ class Doorkeeper:
         kind, _, key = authorization.partition(" ")
         key = key.strip()
         if kind.lower() != "bearer" or not key:
-            raise _unauthorized("there is no key", "send yours as 'Authorization: Bearer adv_…'")
+            raise unauthorized("there is no key", "send yours as 'Authorization: Bearer adv_…'")
         digest = hashlib.sha256(key.encode()).digest()
         known = self._known.get(digest)
         if known is None:
@@ -49,11 +49,11 @@ class Doorkeeper:
         caller = await run_in_threadpool(self._accounts.authenticate, key)
         if caller is None:
             self._known.pop(digest, None)
-            _remember(self._failed, address, (self._counted(address) + 1, self._clock()))
-            raise _unauthorized(
+            remember(self._failed, address, (self._counted(address) + 1, self._clock()))
+            raise unauthorized(
                 "the key is unknown, revoked or expired", "ask for a new one; `advtex-server keys create` makes it"
             )
-        _remember(self._known, digest, (caller, self._clock() + KNOWN_SECONDS))
+        remember(self._known, digest, (caller, self._clock() + KNOWN_SECONDS))
         return caller
 
     def _refuse_after_many_failures(self, address: str) -> None:
@@ -69,13 +69,15 @@ class Doorkeeper:
         return max(0.0, count - (self._clock() - since) * self._limit / 60.0)
 
 
-def _remember(entries: OrderedDict[K, V], key: K, value: V) -> None:
+def remember(entries: OrderedDict[K, V], key: K, value: V) -> None:
+    """As the newest of REMEMBERED entries."""
     entries[key] = value
     entries.move_to_end(key)
     if len(entries) > REMEMBERED:
         entries.popitem(last=False)
 
 
-def _unauthorized(message: str, remedy: str) -> ApiError:
+def unauthorized(message: str, remedy: str) -> ApiError:
+    """401, in words."""
     detail = ErrorDetail(code="bad_key", where="Authorization", message=message, remedy=remedy)
     return ApiError(ErrorCode.unauthorized, f"{message}: {remedy}", [detail])

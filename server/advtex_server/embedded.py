@@ -11,7 +11,7 @@ import shutil
 import socket
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import redis
@@ -20,6 +20,7 @@ from advtex_server.children import Child
 from advtex_store.accounts import Accounts
 
 START_SECONDS = 20.0
+LOWEST_PORT, LOWEST_OUTGOING_PORT = 20_000, 32_768
 
 
 class SetupError(Exception):
@@ -117,10 +118,19 @@ def only_one(data_dir: Path) -> Iterator[None]:
 
 
 def free_port() -> int:
-    """A TCP port of the loopback address that is free now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """A TCP port of the loopback address that is free now, and that no outgoing connection is ever given.
+
+    While a Redis that has ended is started again, its own clients' connections could take a port of theirs from it.
+    """
+    lowest_outgoing = LOWEST_OUTGOING_PORT
+    with suppress(OSError):  # where there is no such file, it is not Linux
+        lowest_outgoing = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text().split()[0])
+    ports = range(LOWEST_PORT, max(lowest_outgoing, LOWEST_PORT + 1000))
+    while True:
+        port = secrets.choice(ports)
+        with suppress(OSError), socket.socket() as probe:
+            probe.bind(("127.0.0.1", port))
+            return port
 
 
 def write_private(path: Path, text: str) -> None:

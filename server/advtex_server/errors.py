@@ -84,11 +84,16 @@ def translated(error: Exception) -> ApiError:
 
 
 def respond(scope: Scope, error: Exception) -> JSONResponse:
-    """The answer to a request that ended in an exception; what is the server's fault is logged."""
+    """The answer to a request that ended in an exception."""
+    return answer(noted(scope, error))
+
+
+def noted(scope: Scope, error: Exception) -> ApiError:
+    """What its user is told; what is the server's fault is logged."""
     told = translated(error)
     if told.status >= 500:
         log.error("request failed", method=scope["method"], path=scope["path"], code=told.body.code, exc_info=error)
-    return answer(told)
+    return told
 
 
 def install(app: FastAPI) -> None:

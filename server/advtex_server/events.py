@@ -7,7 +7,7 @@ import json
 import time
 from collections.abc import AsyncIterator
 
-from sqlalchemy.exc import DBAPIError
+from sqlalchemy.exc import SQLAlchemyError
 from starlette.concurrency import run_in_threadpool
 
 from advtex_contract.jobs import TERMINAL, JobState
@@ -70,7 +70,7 @@ async def stream_events(
             recorded = await asyncio.shield(look.events(seen)) if row.version > seen else []
         except RecordNotFound:
             return
-        except DBAPIError:
+        except SQLAlchemyError:  # also when all connections are in use
             await _pause(stopping)
             continue
         if first or row.version > seen:

@@ -195,11 +195,11 @@ class Receiving:
     def _keep(self) -> None:
         assert self.row.holder is not None
         # The offset says `all` only when the upload is complete, so that a client never stops too early.
-        offset = min(self._partial.offset, self.row.size - 1)
-        if offset > self.kept:
+        if self.kept < (offset := self._partial.offset) < self.row.size:
             self._partial.flush()
             self.expires_at = self._intake.store.uploads.advance(self.row.id, self.row.holder, offset)
             self.kept, self._kept_at = offset, time.monotonic()
+            self._partial.settle()
 
     def _complete(self) -> UploadView:
         blobs, key = self._intake.store.blobs, keys.scan_key(self.row.id)

@@ -33,8 +33,10 @@ app.add_typer(keys, name="keys")
 
 Host = Annotated[str, typer.Option(help="address to listen on")]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one")]
-MaxActiveJobs = Annotated[int | None, typer.Option(min=0, help="jobs of its owner that have not ended, at most")]
-MaxBytes = Annotated[int | None, typer.Option(min=0, help="bytes of its owner's uploads, at most")]
+MaxActiveJobs = Annotated[
+    int | None, typer.Option(min=0, max=2**31 - 1, help="jobs of its owner that have not ended, at most")
+]
+MaxBytes = Annotated[int | None, typer.Option(min=0, max=2**63 - 1, help="bytes of its owner's uploads, at most")]
 
 
 @app.command()

@@ -26,6 +26,7 @@ from advtex_contract.jobs import (
     ResultFile,
     StorageInfo,
 )
+from advtex_contract.live import LiveImage, LiveRecord, LiveView
 from advtex_contract.options import JobOptions
 from advtex_scan.check import check_scan
 from advtex_server.batches import BatchService
@@ -133,7 +134,32 @@ class Service:
             raise ApiError(ErrorCode.not_ready, f"job {job_id} is {row.state}: it has no results")
         raise ApiError(ErrorCode.not_found, f"job {job_id} has no result {name!r}")
 
+    def live(self, owner: str, job_id: str) -> LiveView:
+        """What the job's texture looks like now."""
+        record = self._look(owner, job_id)
+        if record is None:
+            return LiveView()
+        # The step makes the address a new one, so that no cache answers with an older picture.
+        base, query = f"/v1/jobs/{job_id}/live", f"step={record.step}"
+        images = [
+            LiveImage(name=picture.name, view=picture.view, href=f"{base}/{picture.name}?{query}")
+            for picture in record.pictures
+        ]
+        return LiveView(step=record.step, curves=record.curves, images=images)
+
+    def live_picture(self, owner: str, job_id: str, name: str) -> bytes:
+        """A JPEG of `live`."""
+        record = self._look(owner, job_id)
+        for picture in record.pictures if record else ():
+            if picture.name == name:
+                return picture.jpeg
+        raise ApiError(ErrorCode.not_found, f"job {job_id} has no live picture {name!r} now")
+
     # -- inside ---------------------------------------------------------------------------------------------------
+
+    def _look(self, owner: str, job_id: str) -> LiveRecord | None:
+        row = self.store.records.job(job_id, owner)
+        return None if row.state == JobState.succeeded else self.store.live.read(job_id, row.attempt)
 
     @contextmanager
     def _holding(self, reservation: Reservation | None) -> Iterator[None]:
@@ -159,7 +185,7 @@ class Service:
     def _checked_job(self, caller: Caller, spec: JobSpec, reservation: Reservation | None) -> JobRow:
         owner = caller.owner
         with self._local_scan(owner, spec) as path:
-            report = check_scan(path)
+            report = check_scan(path, spec.options.layout)
         details = [
             ErrorDetail(severity=f.severity, code=f.code, where=f.where, message=f.message, remedy=f.remedy)
             for f in report.findings
@@ -170,7 +196,9 @@ class Service:
                 spec,
                 warnings=details,
                 reservation=reservation,
-                memory_bytes=needed_memory(spec.options, report.frames_usable, *report.view_size),
+                memory_bytes=needed_memory(
+                    spec.options, report.frames_usable, *report.view_size, fuses=report.mesh is None
+                ),
                 max_active_jobs=caller.max_active_jobs,
             )
         rejection = _rejection(details)

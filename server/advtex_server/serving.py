@@ -18,8 +18,9 @@ from advtex_server.app import create_app
 from advtex_server.children import Child
 from advtex_server.embedded import EmbeddedRedis, SetupError, client_key, only_one
 from advtex_server.settings import ServerSettings
-from advtex_store.accounts import Accounts
+from advtex_store.accounts import Accounts, key_id
 from advtex_store.database import Database, upgrade_database
+from advtex_store.sessions import Sessions
 
 WORKER_STOP_SECONDS = 60.0  # a worker writes its checkpoint in this time
 WATCH_SECONDS = 0.5
@@ -53,7 +54,8 @@ def up(settings: ServerSettings, host: str, port: int) -> None:
         try:
             upgrade_database(settings.database)
             database = Database(settings.database)
-            client_key(settings.data_dir, Accounts(database), _url(listener))
+            key = client_key(settings.data_dir, Accounts(database), _url(listener))
+            token = Sessions(database).offer(key_id(key))
             database.close()
             worker = Child(
                 "worker",
@@ -68,7 +70,7 @@ def up(settings: ServerSettings, host: str, port: int) -> None:
                 child.ask_to_stop()
                 child.wait()
             raise
-        run(settings, listener, children, lambda: _say_ready(settings, _url(listener)))
+        run(settings, listener, children, lambda: _say_ready(settings, _url(listener), token))
 
 
 def run(
@@ -155,7 +157,11 @@ def _url(listener: socket.socket) -> str:
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
-def _say_ready(settings: ServerSettings, url: str) -> None:
-    print(f"advtex is ready at {url} (data in {settings.data_dir})", file=sys.stderr, flush=True)
+def _say_ready(settings: ServerSettings, url: str, token: str | None = None) -> None:
+    """token: of a link that signs a browser in, once."""
+    page = url if token is None else f"{url}/sign-in?token={token}"
+    print(f"advtex is ready at {url} (data in {settings.data_dir}); its page: {page}", file=sys.stderr, flush=True)
     line = {"event": "ready", "url": url, "data_dir": str(settings.data_dir.absolute()), "pid": os.getpid()}
+    if token is not None:
+        line["page"] = page
     print(json.dumps(line), flush=True)

@@ -24,6 +24,7 @@ class ServerSettings(StoreSettings):
         description="wrong keys that one address may send to one server process; which proxies are believed about "
         "addresses is said by FORWARDED_ALLOW_IPS, uvicorn's own variable",
     )
+    session_seconds: float = Field(default=7 * 86400, gt=0, description="a browser has to sign in again after this")
     webhook_allow_http: bool = Field(default=False, description="webhooks may go to http:// addresses")
     webhook_networks: tuple[IPvAnyNetwork, ...] = Field(
         default=(), description="networks that are not public and that webhooks may go to, as a JSON list"

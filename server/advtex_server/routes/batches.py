@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Query
+from fastapi import APIRouter, Query
 
 from advtex_contract.errors import ErrorCode
-from advtex_contract.jobs import BatchPage, BatchView
+from advtex_contract.jobs import BatchId, BatchPage, BatchView
 from advtex_server.deps import Reader, TheService, Writer
 from advtex_server.refusal import WITH_KEY, refuses
 
 router = APIRouter(prefix="/v1/batches", tags=["batches"], responses=WITH_KEY)
 
-BatchName = Annotated[str, Path(max_length=100)]
 OF_A_BATCH = refuses(ErrorCode.not_found, 422)
 
 
@@ -29,13 +28,13 @@ def list_batches(
 
 
 @router.get("/{batch_id}", responses=OF_A_BATCH)
-def get_batch(batch_id: BatchName, caller: Reader, service: TheService) -> BatchView:
+def get_batch(batch_id: BatchId, caller: Reader, service: TheService) -> BatchView:
     """How many jobs are in which state, and how long the rest takes at the step rates that were measured."""
     return service.batches.view(caller.owner, batch_id)
 
 
 @router.post("/{batch_id}/cancel", responses=OF_A_BATCH)
-def cancel_batch(batch_id: BatchName, caller: Writer, service: TheService) -> BatchView:
+def cancel_batch(batch_id: BatchId, caller: Writer, service: TheService) -> BatchView:
     """Cancel every job that has not ended."""
     return service.batches.cancel(caller.owner, batch_id)
 
@@ -43,6 +42,6 @@ def cancel_batch(batch_id: BatchName, caller: Writer, service: TheService) -> Ba
 @router.post(
     "/{batch_id}/retry-failed", responses=OF_A_BATCH | refuses(ErrorCode.rate_limited, ErrorCode.quota_exceeded)
 )
-def retry_batch(batch_id: BatchName, caller: Writer, service: TheService) -> BatchView:
+def retry_batch(batch_id: BatchId, caller: Writer, service: TheService) -> BatchView:
     """Queue every failed job again; each goes on from its checkpoint."""
     return service.batches.retry_failed(caller, batch_id)

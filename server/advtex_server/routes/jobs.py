@@ -11,17 +11,19 @@ from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 
 from advtex_contract.errors import ErrorCode
-from advtex_contract.jobs import BatchId, JobPage, JobSpec, JobState, JobView, Label
+from advtex_contract.jobs import ID_PATTERN, BatchId, JobPage, JobSpec, JobState, JobView, Label
+from advtex_contract.live import LiveView
 from advtex_server.deps import Reader, TheService, Writer
 from advtex_server.events import stream_events
 from advtex_server.ranges import chosen_range
 from advtex_server.refusal import WITH_KEY, refuses
+from advtex_server.streams import while_welcome
 from advtex_store.submissions import JobFilter
 
 P = ParamSpec("P")
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=WITH_KEY)
 
-JobId = Annotated[str, Path(max_length=64)]
+JobId = Annotated[str, Path(pattern=ID_PATTERN)]
 OF_A_JOB = refuses(ErrorCode.not_found, 422)
 
 EVENT = {  # before OpenAPI 3.2 a stream's schema is that of each event
@@ -140,7 +142,28 @@ def job_events(
     after = int(last_event_id) if last_event_id.isascii() and last_event_id.isdigit() else 0
     events = stream_events(state.lookout, caller.owner, job_id, min(after, 2**62), state.stopping)
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+    events = while_welcome(events, request.state.ask_caller)
     return StreamingResponse(events, media_type="text/event-stream", headers=headers)
+
+
+@router.get("/{job_id}/live", response_model=LiveView, responses=OF_A_JOB)
+async def get_live(job_id: JobId, caller: Reader, service: TheService) -> Response:
+    """A running job's texture as it is now: curves, and small pictures. Fetch it again when the job's step has grown.
+
+    What an attempt has shown stays until the next one shows something.
+    """
+    return await _json(service.live, caller.owner, job_id)
+
+
+@router.get(
+    "/{job_id}/live/{name}",
+    response_class=Response,
+    responses=OF_A_JOB | {200: {"content": {"image/jpeg": {"schema": {"type": "string", "format": "binary"}}}}},
+)
+def get_live_picture(job_id: JobId, name: str, caller: Reader, service: TheService) -> Response:
+    """A picture that `GET /v1/jobs/{job_id}/live` names."""
+    headers = {"Cache-Control": "private, no-cache", "X-Content-Type-Options": "nosniff"}
+    return Response(service.live_picture(caller.owner, job_id, name), media_type="image/jpeg", headers=headers)
 
 
 @router.get(

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
 
 from advtex_contract.errors import ErrorCode
-from advtex_contract.jobs import StorageInfo, UploadList, UploadView
+from advtex_contract.jobs import ID_PATTERN, StorageInfo, UploadList, UploadView
 from advtex_server import tus
 from advtex_server.bodies import OpenBodies, receive
 from advtex_server.deps import Reader, TheIntake, TheService, Writer, reader
@@ -21,7 +21,7 @@ router = APIRouter(prefix="/v1", tags=["uploads"], responses=WITH_KEY)
 PATIENCE = 30.0  # seconds that a request waits for an older one of the same upload to be kept
 HEAD_PATIENCE = 0.3  # a client that asks where to go on has lost its line already
 
-UploadId = Annotated[str, Path(max_length=64)]
+UploadId = Annotated[str, Path(pattern=ID_PATTERN)]
 TusVersion = Annotated[str | None, Header(description="1.0.0; without it this is a plain upload")]
 TusChecksum = Annotated[str | None, Header(description="tus: algorithm and base64 digest of this body")]
 OTHER_TUS = refuses(ErrorCode.precondition_failed)

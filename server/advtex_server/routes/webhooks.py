@@ -7,13 +7,14 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Response
 
 from advtex_contract.errors import ErrorCode
+from advtex_contract.jobs import ID_PATTERN
 from advtex_contract.webhooks import WebhookList, WebhookSpec, WebhookView
 from advtex_server.deps import Reader, TheWebhooks, Writer
 from advtex_server.refusal import WITH_KEY, refuses
 
 router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"], responses=WITH_KEY)
 
-WebhookId = Annotated[str, Path(max_length=64)]
+WebhookId = Annotated[str, Path(pattern=ID_PATTERN)]
 OF_A_WEBHOOK = refuses(ErrorCode.not_found, 422)
 
 

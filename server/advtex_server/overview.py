@@ -1,0 +1,97 @@
+"""What the page's list of jobs shows, and the stream of what changes in it."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator
+from datetime import UTC, datetime
+
+from pydantic import BaseModel
+from sqlalchemy.exc import SQLAlchemyError
+from starlette.concurrency import run_in_threadpool
+
+from advtex_contract.jobs import JobState
+from advtex_contract.options import Method, Preset
+from advtex_server.events import PING_SECONDS
+from advtex_store.models import JobRow
+from advtex_store.overviews import Overviews
+
+POLL_SECONDS = 1.0
+LIFETIME_SECONDS = 300.0  # of a stream; the browser comes back, and has to be signed in still
+OVERLAP_SECONDS = 5.0  # a change may become visible this long after the time that it carries
+
+
+class JobSummary(BaseModel):
+    """One line of the list. problem: why it failed or was rejected, in a sentence."""
+
+    id: str
+    state: JobState
+    label: str
+    batch: str | None
+    preset: Preset
+    method: Method
+    stage: str
+    step: int
+    steps: int
+    eta_seconds: float | None
+    waiting_reason: str
+    problem: str
+    created_at: datetime
+    finished_at: datetime | None
+    deleted: bool
+
+
+def job_summary(row: JobRow) -> JobSummary:
+    """The row as the list shows it."""
+    progress = row.progress
+    return JobSummary(
+        id=row.id,
+        state=JobState(row.state),
+        label=row.label,
+        batch=row.batch,
+        preset=row.options["preset"],
+        method=row.options["method"],
+        stage=progress.get("stage", ""),
+        step=progress.get("step", 0),
+        steps=progress.get("steps", 0),
+        eta_seconds=progress.get("eta_seconds"),
+        waiting_reason=row.waiting_reason,
+        problem=(row.error or {}).get("message", ""),
+        created_at=datetime.fromtimestamp(row.created_at, UTC),
+        finished_at=None if row.finished_at is None else datetime.fromtimestamp(row.finished_at, UTC),
+        deleted=row.deleted_at is not None,
+    )
+
+
+async def stream_changes(overviews: Overviews, owner: str, since: float, stopping: asyncio.Event) -> AsyncIterator[str]:
+    """Server-sent `job` events, one per change of a job after `since`, for some minutes.
+
+    Ids are times in milliseconds: a browser that comes back says the last one. What changed shortly before is sent
+    again, as each message is the whole summary.
+    """
+    sent: dict[str, float] = {}
+    newest, spoken = since, time.monotonic()
+    end = spoken + LIFETIME_SECONDS
+    while not stopping.is_set() and time.monotonic() < end:
+        try:
+            rows = await run_in_threadpool(overviews.changed, owner, newest - OVERLAP_SECONDS)
+        except SQLAlchemyError:
+            rows = []
+        fresh = [row for row in rows if sent.get(row.id) != row.updated_at]
+        if fresh:
+            yield "".join(_message(row) for row in fresh)
+            spoken = time.monotonic()
+            newest = max(newest, fresh[-1].updated_at)
+            sent = {row.id: row.updated_at for row in rows if row.updated_at > newest - OVERLAP_SECONDS}
+        elif time.monotonic() - spoken > PING_SECONDS:
+            yield ": ping\n\n"
+            spoken = time.monotonic()
+        try:
+            await asyncio.wait_for(stopping.wait(), POLL_SECONDS)
+        except TimeoutError:
+            continue
+
+
+def _message(row: JobRow) -> str:
+    return f"id: {int(row.updated_at * 1000)}\nevent: job\ndata: {job_summary(row).model_dump_json()}\n\n"

@@ -26,6 +26,7 @@ from advtex_client.errors import (
 )
 from advtex_client.manifests import retention_seconds
 from advtex_contract.options import METHOD_HELP, PRESET_HELP, JobOptions, Method, Preset
+from advtex_scan.layouts import LAYOUT_NAMES
 
 EXIT_CODES: dict[type[ClientError], int] = {
     AuthError: 3,
@@ -41,7 +42,14 @@ EXIT_CODES: dict[type[ClientError], int] = {
 USAGE = 2
 INTERRUPTED = 130
 
-ScanPath = Annotated[Path, typer.Argument(exists=True, readable=True, help="a scan: a folder or a zip")]
+
+def _known_layout(name: str | None) -> str | None:
+    if name is not None and name not in LAYOUT_NAMES:
+        raise typer.BadParameter(f"{name!r} is no layout; choose one of {', '.join(LAYOUT_NAMES)}")
+    return name
+
+
+ScanPath = Annotated[Path, typer.Argument(exists=True, readable=True, help="a scan: a folder, zip, .r3d or .sens")]
 JobId = Annotated[str, typer.Argument(help="the job's id, as `submit` prints it", metavar="JOB")]
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON on stdout")]
 Url = Annotated[str | None, typer.Option("--url", help="the server; else ADVTEX_URL or the configuration file")]
@@ -56,6 +64,15 @@ MethodOption = Annotated[Method, typer.Option("--method", help=_METHODS)]
 SizeOption = Annotated[str | None, typer.Option("--size", metavar="WxH", help="working size of the views, pixels")]
 HoldoutOption = Annotated[int | None, typer.Option("--holdout", help="leave out every Nth frame and score on it")]
 StepsOption = Annotated[int | None, typer.Option("--steps", help="overrides the preset's step count")]
+LayoutOption = Annotated[
+    str | None,
+    typer.Option(
+        "--layout",
+        metavar="NAME",
+        callback=_known_layout,
+        help=f"how the files are laid out; else found out. One of {', '.join(LAYOUT_NAMES)}",
+    ),
+]
 PriorityOption = Annotated[int, typer.Option("--priority", min=-100, max=100, help="larger runs earlier")]
 KeepOption = Annotated[
     float | None, typer.Option("--keep-days", help="how long a job is kept after its end; else the server's usual time")

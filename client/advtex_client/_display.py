@@ -176,16 +176,29 @@ def job_lines(job: JobView) -> str:
             lines.append(f"left     about {duration(progress.eta_seconds)} of this stage")
     if progress.losses:
         lines.append("losses   " + ", ".join(f"{name} {value:.4g}" for name, value in progress.losses.items()))
+    lines += [f"note     {note}" for note in progress.notes]
     lines += [f"warning  {line}" for line in finding_lines(job.warnings)]
     if job.error:
         lines += [f"error    {job.error.message}", *(f"         {line}" for line in finding_lines(job.error.details))]
         lines += [f"log      {line}" for line in job.error.log_tail.splitlines()[-LOG_LINES:]]
-    lines += [f"result   {file.name} ({file.size} bytes)" for file in job.results]
+    lines += result_lines(job.results)
     if job.expires_at:
         lines.append(f"kept until {job.expires_at.astimezone(UTC):%Y-%m-%d %H:%M} UTC")
     elif job.retention_seconds:
         lines.append(f"kept     {job.retention_seconds / 86400:.4g} days after its end")
     return "\n".join(lines)
+
+
+def result_lines(files: Sequence[ResultFile]) -> list[str]:
+    """The files, those of a folder in one line."""
+    folders: dict[str, list[int]] = {}
+    for file in files:
+        folder, slash, _ = file.name.partition("/")
+        folders.setdefault(folder + slash, []).append(file.size)
+    return [
+        f"result   {name} ({f'{len(sizes)} files, ' if name.endswith('/') else ''}{sum(sizes)} bytes)"
+        for name, sizes in folders.items()
+    ]
 
 
 def job_table(jobs: Sequence[JobView]) -> str:

@@ -49,9 +49,9 @@ def job_spec(
         raise ClientError(f"{first['loc'][0]} {first['input']!r} cannot be used: {first['msg']}") from error
 
 
-def ensure_submittable(scan: Path) -> None:
+def ensure_submittable(scan: Path, options: JobOptions) -> None:
     """The check that the server makes too, before anything is sent. Raises ScanRejectedError with every finding."""
-    report = check_scan(scan)
+    report = check_scan(scan, options.layout)
     if report.ok:
         return
     details = [

@@ -109,7 +109,7 @@ class AsyncClient:
         `retention_seconds`: how long it is kept after its end.
         """
         spec = job_spec(options, label, priority=priority, retention_seconds=retention_seconds)
-        await run_sync(ensure_submittable, scan)
+        await run_sync(ensure_submittable, scan, spec.options)
         with ExitStack() as stack:
             archive = await run_sync(stack.enter_context, packed(scan))
             memory = SubmissionMemory(self.config.url, archive.sha256, spec.options.model_dump_json(), label)
@@ -121,7 +121,7 @@ class AsyncClient:
         if (job_id := memory.load().job_id) is not None:
             with suppress(NotFoundError):
                 return await self.get_job(job_id)
-        await run_sync(ensure_submittable, scan)
+        await run_sync(ensure_submittable, scan, spec.options)
         with ExitStack() as stack:
             archive = await run_sync(stack.enter_context, packed(scan))
             return await self._submit(memory, archive, spec, False, None)

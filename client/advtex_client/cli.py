@@ -20,6 +20,7 @@ from advtex_client._cli import (
     HoldoutOption,
     JobId,
     KeepOption,
+    LayoutOption,
     MethodOption,
     PresetOption,
     PriorityOption,
@@ -36,6 +37,7 @@ from advtex_client._cli import (
 )
 from advtex_client._display import Display, finding_lines, job_lines, job_table
 from advtex_client.client import Client
+from advtex_client.deep import deep_lines, deep_report
 from advtex_client.doctor import examine
 from advtex_client.errors import ScanRejectedError
 from advtex_contract.jobs import TERMINAL, JobState, JobView
@@ -55,12 +57,24 @@ app.add_typer(cli_batch.app, name="batch")
 
 
 @app.command()
-def check(scan: ScanPath, as_json: AsJson = False) -> None:
+def check(
+    scan: ScanPath,
+    deep: Annotated[
+        bool, typer.Option("--deep", help="also measure whether depth, mesh, colors and poses agree; needs the engine")
+    ] = False,
+    layout: LayoutOption = None,
+    as_json: AsJson = False,
+) -> None:
     """Check a scan on this computer: every problem, where it is, and what helps."""
     with command(as_json) as display:
-        report = check_scan(scan)
-        display.data(report.to_dict(), report.format_text())
-        if not report.ok:
+        report = check_scan(scan, layout)
+        found, text, hopeless = report.to_dict(), report.format_text(), False
+        if deep and report.frames_usable:
+            measured = deep_report(scan, layout)
+            found["conventions"], text = measured, "\n".join([text, *deep_lines(measured)])
+            hopeless = measured is not None and bool(measured["hopeless"])
+        display.data(found, text)
+        if hopeless or not report.ok:
             raise typer.Exit(EXIT_CODES[ScanRejectedError])
 
 
@@ -74,7 +88,9 @@ def submit(
     steps: StepsOption = None,
     seed: Annotated[int | None, typer.Option(help="of the random numbers")] = None,
     face_budget: Annotated[int | None, typer.Option(help="decimate the mesh to this many faces")] = None,
+    max_views: Annotated[int | None, typer.Option(help="choose this many frames of a longer scan")] = None,
     max_texture_size: Annotated[int | None, typer.Option(help="cap on the texture's side, texels")] = None,
+    layout: LayoutOption = None,
     label: Annotated[str, typer.Option(help="a name of your own for the job")] = "",
     priority: PriorityOption = 0,
     keep_days: KeepOption = None,
@@ -96,9 +112,11 @@ def submit(
             height=height,
             steps=steps,
             face_budget=face_budget,
+            max_views=max_views,
             max_texture_size=max_texture_size,
             holdout=holdout,
             seed=seed,
+            layout=layout,
         )
         kept = retention(keep_days)
         with Client(url, api_key) as client:

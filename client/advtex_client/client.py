@@ -106,7 +106,7 @@ class Client:
         `retention_seconds`: how long it is kept after its end.
         """
         spec = job_spec(options, label, priority=priority, retention_seconds=retention_seconds)
-        ensure_submittable(scan)
+        ensure_submittable(scan, spec.options)
         with packed(scan) as archive:
             memory = SubmissionMemory(self.config.url, archive.sha256, spec.options.model_dump_json(), label)
             return self._submit(memory, archive, spec, new, on_bytes)
@@ -117,7 +117,7 @@ class Client:
         if (job_id := memory.load().job_id) is not None:
             with suppress(NotFoundError):
                 return self.get_job(job_id)
-        ensure_submittable(scan)
+        ensure_submittable(scan, spec.options)
         with packed(scan) as archive:
             return self._submit(memory, archive, spec, False, None)
 

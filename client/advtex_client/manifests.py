@@ -1,6 +1,6 @@
 """What a batch consists of: a folder of scans, or a manifest (CSV or JSON lines) that lists them.
 
-path       a scan's folder or zip, relative to the manifest, or its file:// or s3:// URL on the server's side
+path       a scan's folder, zip or .sens, relative to the manifest, or its file:// or s3:// URL on the server's side
 label      the job's name; the last part of the path if it is left out
 options    a JSON object of options that differ from those of the command
 priority   larger runs earlier
@@ -22,6 +22,7 @@ from advtex_client.errors import ClientError
 from advtex_contract.options import JobOptions
 
 COLUMNS = ("path", "label", "options", "priority", "keep_days")
+FILES = (".zip", ".r3d", ".sens")  # Record3D's files are zips
 SCHEMES = ("file://", "s3://")
 
 
@@ -87,7 +88,7 @@ def read_items(
 
 def _scans(folder: Path) -> list[str]:
     paths = (path for path in folder.iterdir() if not path.name.startswith("."))
-    return sorted(path.name for path in paths if path.is_dir() or path.suffix.lower() == ".zip")
+    return sorted(path.name for path in paths if path.is_dir() or path.suffix.lower() in FILES)
 
 
 def _rows(manifest: Path) -> Iterator[tuple[int, Mapping[str, Any]]]:

@@ -38,7 +38,7 @@ class PackedScan:
 
 @contextmanager
 def packed(scan: Path) -> Iterator[PackedScan]:
-    """The zip itself, or a folder packed into a temporary zip that is gone afterwards.
+    """The file itself, or a folder packed into a temporary zip that is gone afterwards.
 
     Equal folders give equal bytes: members are sorted, stored, and carry no dates or permissions. Names that begin
     with a dot are left out. Raises ClientError when the scan cannot be read or the temporary disk is full.
@@ -64,7 +64,7 @@ def _unreadable(scan: Path, error: OSError) -> str:
             f"{problem}; {scan} is packed below {tempfile.gettempdir()}, which needs as much free space as the scan; "
             "set TMPDIR to a larger disk or give a zip"
         )
-    return f"{problem}; give a scan folder or zip that can be read"
+    return f"{problem}; give a scan's folder or file that can be read"
 
 
 def scan_members(folder: Path) -> list[tuple[str, Path]]:

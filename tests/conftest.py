@@ -6,7 +6,6 @@ import importlib.util
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -19,6 +18,7 @@ import psycopg
 import pytest
 import redis
 
+from advtex_server.embedded import free_port
 from advtex_store.blobs import Blobs, open_blobs
 from advtex_store.database import upgrade_database
 
@@ -37,12 +37,6 @@ def load(path: Path) -> ModuleType:
         sys.modules[name] = module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
     return sys.modules[name]
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 class RedisServer:
@@ -234,6 +228,22 @@ def blobs(request: pytest.FixtureRequest, tmp_path: Path) -> Blobs:
     """Runs the test on both storages."""
     url = (tmp_path / "blobs").as_uri() if request.param == "folder" else request.getfixturevalue("s3_url")
     return open_blobs(url, tmp_path / "spool")
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Whatever is built on `place` runs on one machine and in a fleet, unless it is marked `one_machine`."""
+    if "place" in metafunc.fixturenames:
+        only_here = metafunc.definition.get_closest_marker("one_machine") is not None
+        metafunc.parametrize("place", ["one machine"] if only_here else ["one machine", "fleet"], indirect=True)
+
+
+@pytest.fixture
+def place(request: pytest.FixtureRequest) -> dict[str, str]:
+    """Settings that say where rows and blobs are: SQLite and a folder, or PostgreSQL and S3."""
+    if request.param == "one machine":
+        return {}
+    database = str(request.getfixturevalue("postgres_url")).replace("postgresql:", "postgresql+psycopg:")
+    return {"database_url": database, "blob_url": request.getfixturevalue("s3_url")}
 
 
 @pytest.fixture

@@ -26,10 +26,12 @@ from torch import Tensor
 from advtex_engine.atlas import build_atlas
 from advtex_engine.checkpoint import WorkFolder
 from advtex_engine.config import TextureConfig
-from advtex_engine.evaluate import PATCH_METRICS, VIEW_METRICS, Comparison, score
+from advtex_engine.evaluate import PATCH_METRICS, VIEW_METRICS, Comparison, evaluate, score
+from advtex_engine.export import export_model
 from advtex_engine.files import write_atomically
 from advtex_engine.geometry import clean, decimate
 from advtex_engine.ingest import ingest
+from advtex_engine.live import Live
 from advtex_engine.methods import METHODS, MethodInput
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.view_selection import select_views
@@ -53,6 +55,19 @@ SCORES = {
     "gradient_difference": "gradient difference",
     "gradient_ratio": "gradient ratio",
 }
+SCAN_SCORES = {
+    "lpips": "LPIPS",
+    "lpips_full": "full image",
+    "gradient_ratio": "gradient ratio",
+    "band_error": "band error",
+    "s3_ratio": "S3 ratio",
+    "flat_energy": "energy where flat",
+    "nearest_patch": "nearest patch",
+    "nearest_patch_reverse": "nearest patch, photo to texture",
+    "psnr": "PSNR",
+    "coverage": "coverage",
+}
+"""Of real scans, where there are photographs instead of the truth."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,7 +106,8 @@ def prepare(scan: Path, config: TextureConfig, work: Path, device: torch.device,
     maps = build_view_maps(atlas, scene.views, scene.kind)
     preset = resolve_preset(config, device)
     folder = WorkFolder(work, "", monitor)
-    return MethodInput(scene, atlas, {1: maps}, {1: mean_texture(maps)}, preset, config, monitor, folder)
+    live = Live(scene, atlas, monitor)
+    return MethodInput(scene, atlas, {1: maps}, {1: mean_texture(maps)}, preset, config, monitor, folder, live)
 
 
 def moved(mesh: Mesh, device: torch.device) -> Mesh:
@@ -142,6 +158,26 @@ def score_texture(atlas: Atlas, texture: Tensor, truth: Truth, lpips: Lpips) -> 
     return {name: sum(values) / len(values) if values else math.nan for name, values in known.items()}
 
 
+def score_model(
+    given: MethodInput, texture: Tensor, scan: Path, folder: Path, reference: Path | None, weights: Path | None
+) -> dict[str, float]:
+    """Means over the scan's held-out frames of the model with this texture; it is left in `folder`, with a sheet."""
+    atlas = dataclasses.replace(given.atlas, mesh=moved(given.atlas.mesh, torch.device("cpu")))
+    folder.mkdir(parents=True, exist_ok=True)
+    export_model(folder, atlas, texture, up_axis=given.scene.up_axis)
+    found = evaluate(
+        folder / "model.obj",
+        scan,
+        size=given.config.size,
+        holdout=given.config.holdout,
+        reference=reference,
+        weights=weights,
+        sheet=folder / "sheet.png",
+    )
+    scores = {name: value for name in SCAN_SCORES if (value := found.mean[name]) is not None}
+    return scores | {"heldout_views": float(found.mean["views"])}
+
+
 class Results:
     """Cells of a benchmark in a JSON file: each its settings, its scores and how it was made."""
 
@@ -174,6 +210,11 @@ def command() -> str:
 def mean_of(cells: Sequence[Mapping[str, Any]], name: str) -> float:
     """Mean of a score over cells."""
     return sum(float(cell["scores"][name]) for cell in cells) / len(cells)
+
+
+def shown_mean(cells: Sequence[Mapping[str, Any]], name: str) -> float | str:
+    """The same for a table: a dash where a cell lacks the score."""
+    return mean_of(cells, name) if all(name in cell["scores"] for cell in cells) else "-"
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

@@ -1,10 +1,11 @@
-"""What each part is worth: the whole, and the whole with one part switched off, on synthetic scans with known truth.
+"""What each part is worth: the whole, and the whole with one part switched off.
 
-    python tests/benchmarks/parts.py [--models 2] [--steps 1000]
+    python tests/benchmarks/parts.py [SCAN …] [--models 2] [--steps 1000]
 
-Scans have the errors that real ones have (`advtex_engine.synthesize`). Writes parts.json (one cell per object and
-variant), parts.md, and per object a picture: a photograph from a held-out place beside the mean, view selection and the
-whole. Stopped and run again, it goes on with the cells that are missing.
+On synthetic scans with known truth, which have the errors that real ones have (`advtex_engine.synthesize`), and on
+scans of one's own against every 8th frame, held out. Writes parts.json (one cell per scan and variant), parts.md, and
+per synthetic object a picture: a photograph from a held-out place beside the mean, view selection and the whole; per
+real scan and variant the model and a contact sheet. Stopped and run again, it goes on with the missing cells.
 """
 
 from __future__ import annotations
@@ -12,11 +13,13 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 from harness import (
+    SCAN_SCORES,
     SCORES,
     Results,
     Stopwatch,
@@ -25,16 +28,18 @@ from harness import (
     configuration,
     load_truth,
     markdown_table,
-    mean_of,
     needed_lpips,
     parsed_size,
     prepare,
     run_method,
+    score_model,
     score_texture,
+    shown_mean,
     write_report,
 )
 from torch import Tensor
 
+from advtex_engine.config import TextureConfig
 from advtex_engine.methods import MethodInput
 from advtex_engine.perceptual import Lpips
 from advtex_engine.pipeline import choose_device, resolve_preset
@@ -63,19 +68,27 @@ VARIANTS = {
 }
 SHOWN = ("mean", "view selection", "the whole")
 SHOWN_VIEW = 1  # of the held-out ones
+HOLDOUT, SCAN_FACES = 8, 80_000  # of scans of one's own
 
 
 def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
     parser = common_arguments("parts", __doc__)
+    parser.add_argument("scans", nargs="*", type=Path, help="folders or zip files")
     parser.add_argument("--models", type=int, default=2, help="objects, with other prints each")
     parsed: argparse.Namespace = parser.parse_args(line)
     return parsed
 
 
 def settings_of(arguments: argparse.Namespace, model: int, variant: str) -> dict[str, Any]:
-    """What a cell is found by."""
+    """What a cell of a synthetic scan is found by."""
     shared = {name: getattr(arguments, name) for name in ("views", "size", "steps", "preset", "faces")}
     return {"model": model, "variant": variant, **shared}
+
+
+def scan_settings_of(arguments: argparse.Namespace, scan: Path, variant: str) -> dict[str, Any]:
+    """What a cell of a real scan is found by."""
+    shared = {name: getattr(arguments, name) for name in ("size", "steps", "preset")}
+    return {"scan": scan.stem, "variant": variant, **shared}
 
 
 def fill(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
@@ -90,23 +103,51 @@ def fill(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
             scan, work = Path(folder) / "scan", Path(folder) / "work"
             synthesize(scan, views=arguments.views, width=width, height=height, seed=model)
             truth = load_truth(scan)
-            inputs: dict[bool, MethodInput] = {}
+            config = configuration(arguments, "adversarial")
             shown: dict[str, Tensor] = {}
-            for name in missing:
-                variant = VARIANTS[name]
-                config = dataclasses.replace(configuration(arguments, variant.method), refine=variant.refine)
-                if variant.refine not in inputs:
-                    inputs[variant.refine] = prepare(scan, config, work, device)
-                preset = dataclasses.replace(resolve_preset(config, device), **variant.changes)
-                given = dataclasses.replace(inputs[variant.refine], config=config, preset=preset)
-                watch = Stopwatch()
-                texture = run_method(given, variant.method)
-                seconds = watch.seconds
+            for name, given, texture, seconds in textures(missing, scan, config, work, device):
                 shown[name] = render_view(given.atlas, texture, truth.cameras[SHOWN_VIEW])
                 scores = score_texture(given.atlas, texture, truth, lpips)
                 results.add(settings_of(arguments, model, name), scores, seconds)
             if set(SHOWN) <= shown.keys():
                 draw(arguments.results / f"object_{model}.png", truth, [shown[name] for name in SHOWN])
+
+
+def fill_scans(arguments: argparse.Namespace, results: Results) -> None:
+    """The same on real scans, whose frames are scored against the model that was written."""
+    device = choose_device(arguments.device)
+    for scan in arguments.scans:
+        missing = [name for name in VARIANTS if results.find(scan_settings_of(arguments, scan, name)) is None]
+        config = TextureConfig(
+            preset=arguments.preset,
+            size=parsed_size(arguments.size),
+            holdout=HOLDOUT,
+            steps=arguments.steps,
+            face_budget=SCAN_FACES,
+            device=arguments.device,
+        )
+        with tempfile.TemporaryDirectory(prefix="advtex-parts-") as folder:
+            for name, given, texture, seconds in textures(missing, scan, config, Path(folder), device):
+                kept = arguments.results / scan.stem / name.replace(" ", "_")
+                scores = score_model(given, texture, scan, kept, None, arguments.lpips_weights)
+                results.add(scan_settings_of(arguments, scan, name), scores, seconds)
+
+
+def textures(
+    variants: list[str], scan: Path, config: TextureConfig, work: Path, device: torch.device
+) -> Iterator[tuple[str, MethodInput, Tensor, float]]:
+    """Per variant what its method was given, the texture [H,W,3] and the seconds that it took."""
+    inputs: dict[bool, MethodInput] = {}
+    for name in variants:
+        variant = VARIANTS[name]
+        changed = dataclasses.replace(config, method=variant.method, refine=variant.refine)
+        if variant.refine not in inputs:
+            inputs[variant.refine] = prepare(scan, changed, work, device)
+        preset = dataclasses.replace(resolve_preset(changed, device), **variant.changes)
+        given = dataclasses.replace(inputs[variant.refine], config=changed, preset=preset)
+        watch = Stopwatch()
+        texture = run_method(given, variant.method)
+        yield name, given, texture, watch.seconds
 
 
 def draw(path: Path, truth: Truth, pictures: list[Tensor]) -> None:
@@ -120,23 +161,31 @@ def draw(path: Path, truth: Truth, pictures: list[Tensor]) -> None:
 
 
 def report(arguments: argparse.Namespace, results: Results) -> None:
-    """parts.md: means over the objects."""
-    rows, found = [], list[dict[str, Any]]()
-    for name in VARIANTS:
-        here = [results.find(settings_of(arguments, model, name)) for model in range(arguments.models)]
-        cells = [cell for cell in here if cell is not None]
-        found += cells
-        rows.append(
-            [name, *(mean_of(cells, score) for score in SCORES), sum(cell["seconds"] for cell in cells) / len(cells)]
-        )
-    table = markdown_table(["variant", *SCORES.values(), "seconds"], rows)
-    write_report(arguments.results / "parts.md", "What each part is worth", found, table)
+    """parts.md: means over the synthetic objects, then a table per scan."""
+    objects = [
+        [results.find(settings_of(arguments, model, name)) for model in range(arguments.models)] for name in VARIANTS
+    ]
+    tables = {"Synthetic scans": (SCORES, objects)}
+    for scan in arguments.scans:
+        lines = [[results.find(scan_settings_of(arguments, scan, name))] for name in VARIANTS]
+        tables[scan.stem] = (SCAN_SCORES, lines)
+    body, found = "", list[dict[str, Any]]()
+    for title, (scores, lines) in tables.items():
+        rows = []
+        for name, line in zip(VARIANTS, lines, strict=True):
+            if cells := [cell for cell in line if cell is not None]:
+                seconds = sum(cell["seconds"] for cell in cells) / len(cells)
+                rows.append([name, *(shown_mean(cells, score) for score in scores), seconds])
+                found += cells
+        body += f"\n## {title}\n\n{markdown_table(['variant', *scores.values(), 'seconds'], rows)}"
+    write_report(arguments.results / "parts.md", "What each part is worth", found, body)
 
 
 def main(line: list[str] | None = None) -> None:
     arguments = arguments_of(line)
     results = Results(arguments.results / "parts.json")
     fill(arguments, results, needed_lpips(arguments.lpips_weights))
+    fill_scans(arguments, results)
     report(arguments, results)
 
 

@@ -10,12 +10,14 @@ import discriminator
 import harness
 import parts
 import pytest
+import scans
 import sparsity
 import study
 import torch
 
 from advtex_engine.discriminator import PatchDiscriminator
 from advtex_engine.perceptual import NETWORKS
+from advtex_engine.synthesize import synthesize
 
 SMALL = ["--views", "6", "--size", "64x64", "--steps", "2", "--faces", "600", "--device", "cpu"]
 
@@ -142,11 +144,37 @@ def test_a_benchmark_without_weights_ends_with_one_sentence(tmp_path: Path) -> N
 
 @pytest.mark.slow
 def test_each_part_is_switched_off_once(tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    line = [*SMALL, "--models", "1", "--lpips-weights", str(weights), "--results", str(tmp_path)]
+    synthesize(tmp_path / "desk", views=6, width=64, height=64)
+    monkeypatch.setattr(parts, "HOLDOUT", 3)
+    monkeypatch.setattr(parts, "SCAN_FACES", 600)
+    some = (*parts.SHOWN, "without refined cameras")
+    monkeypatch.setattr(parts, "VARIANTS", {name: parts.VARIANTS[name] for name in some})
+    line = [str(tmp_path / "desk"), *SMALL, "--models", "1", "--lpips-weights", str(weights)]
+    line += ["--results", str(tmp_path)]
     parts.main(line)
     page = (tmp_path / "parts.md").read_text()
-    assert all(f"| {variant} |" in page for variant in parts.VARIANTS)
+    assert all(page.count(f"| {variant} |") == 2 for variant in parts.VARIANTS)
     assert (tmp_path / "object_0.png").stat().st_size > 1000
+    assert (tmp_path / "desk" / "the_whole" / "sheet.png").stat().st_size > 1000
 
-    monkeypatch.setattr(parts, "synthesize", lambda *_, **__: pytest.fail("every cell is there already"))
+    monkeypatch.setattr(parts, "prepare", lambda *_: pytest.fail("every cell is there already"))
     parts.main(line)
+
+
+@pytest.mark.slow
+def test_methods_are_compared_on_a_scan(tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synthesize(tmp_path / "desk", views=6, width=96, height=64)
+    line = [str(tmp_path / "desk"), "--size", "96x64", "--holdout", "3", "--steps", "2", "--device", "cpu"]
+    line += ["--methods", "mean", "view_selection", "--lpips-weights", str(weights), "--results", str(tmp_path / "out")]
+    scans.main(line)
+    found = json.loads((tmp_path / "out" / "scans.json").read_text())["cells"]
+    assert {(cell["settings"]["method"], cell["scores"]["heldout_views"]) for cell in found} == {
+        ("mean", 2.0),
+        ("view_selection", 2.0),
+    }
+    page = (tmp_path / "out" / "scans.md").read_text()
+    assert all(f"| {method} |" in page for method in ("mean", "view_selection"))
+    assert (tmp_path / "out" / "desk" / "mean" / "sheet.png").stat().st_size > 1000
+
+    monkeypatch.setattr(scans, "prepare", lambda *_: pytest.fail("every cell is there already"))
+    scans.main(line)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import json
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from advtex_client import cli, cli_batch
 from advtex_client._display import duration, job_lines, job_table
 from advtex_client.client import Client
 from advtex_contract.errors import ErrorCode, ErrorDetail
-from advtex_contract.jobs import BatchView, JobError, JobPage, JobState
+from advtex_contract.jobs import BatchView, JobError, JobPage, JobState, ResultFile
 
 WHY = "no worker is running"
 
@@ -84,6 +85,17 @@ def test_a_bad_scan_is_4_with_every_finding_and_its_remedy(server: FakeServer, s
     assert all(detail["remedy"] for detail in body["details"] if detail["severity"] == "error")
 
 
+def test_a_layout_can_be_asked_for(server: FakeServer, scan: Path) -> None:
+    assert json.loads(run("check", scan, "--layout", "native", "--json").stdout)["layout"] == "native"
+    refused = run("check", scan, "--layout", "tum")
+    assert refused.exit_code == 4
+    assert "not laid out as tum; they look like native" in refused.stdout
+    assert run("submit", scan, "--layout", "tum").exit_code == 4
+    assert not server.jobs
+    assert run("submit", scan, "--layout", "native").exit_code == 0
+    assert server.jobs["j0"].options.layout == "native"
+
+
 def test_how_long_a_job_is_kept_is_asked_and_shown(server: FakeServer, scan: Path) -> None:
     assert run("submit", scan, "--keep-days", "1.5").exit_code == 0
     assert server.jobs["j0"].retention_seconds == 129_600
@@ -102,6 +114,7 @@ def test_how_long_a_job_is_kept_is_asked_and_shown(server: FakeServer, scan: Pat
         (["--keep-days", "0.0001"], "retention_seconds 9"),
         (["--preset", "turbo"], "turbo"),
         (["--method", "magic"], "magic"),
+        (["--layout", "magic"], "tum"),
         (["--label", "two\nlines"], "label"),
     ],
 )
@@ -189,6 +202,13 @@ def test_a_job_in_words() -> None:
     assert "left" not in text, "nothing is left of a job that has ended"
     running = job_lines(job.model_copy(update={"state": JobState.running}))
     assert "about 3 min 20 s" in running
+    names = ("index.html", "previews/manifest.json", "previews/views/0.jpg")
+    files = [ResultFile(name=name, size=4, sha256="0" * 64, content_type="x", url="/") for name in names]
+    job.progress.notes = ["12 of 30 frames become views"]
+    ended = job_lines(job.model_copy(update={"results": files})).splitlines()
+    assert "note     12 of 30 frames become views" in ended
+    told = [line for line in ended if line.startswith("result")]
+    assert told == ["result   index.html (4 bytes)", "result   previews/ (2 files, 8 bytes)"]
 
 
 def test_why_a_job_waits_is_shown_wherever_it_is(server: FakeServer) -> None:
@@ -262,3 +282,40 @@ def test_the_client_stays_light() -> None:
 
 def test_the_installed_command_exists() -> None:
     assert callable(importlib.import_module("advtex_client.cli").main)
+
+
+def deep_answer(monkeypatch: pytest.MonkeyPatch, hopeless: bool, stdout: str | None = None) -> list[list[str]]:
+    """Lets the engine's process answer at once; the commands that were asked for."""
+    problem = {"code": "camera_axes", "where": "scan.json", "message": "the poses seem to be", "remedy": "turn them"}
+    report = {"frames": 14, "summary": "all agrees", "hopeless": hopeless, "problems": [problem] if hopeless else []}
+    asked = []
+
+    def answer(command: list[str], **_options: object) -> subprocess.CompletedProcess[str]:
+        asked.append(command)
+        return subprocess.CompletedProcess(command, 1, json.dumps(report) if stdout is None else stdout, "no such\nwhy")
+
+    monkeypatch.setattr(subprocess, "run", answer)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name)
+    return asked
+
+
+def test_a_deep_check_adds_what_the_engine_measured(scan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = deep_answer(monkeypatch, hopeless=False)
+    ran = run("check", scan, "--deep")
+    assert ran.exit_code == 0
+    assert "measured 14 frames: all agrees\nno other convention fits clearly better" in ran.stdout
+    assert asked == [[sys.executable, "-m", "advtex_engine", "check", str(scan), "--json"]]
+    deep_answer(monkeypatch, hopeless=True)
+    ran = run("check", scan, "--deep", "--json")
+    assert ran.exit_code == 4
+    assert json.loads(ran.stdout)["conventions"]["problems"][0]["code"] == "camera_axes"
+    assert "error    scan.json: the poses seem to be\n         -> turn them" in run("check", scan, "--deep").stdout
+
+
+def test_a_deep_check_without_the_engine_says_what_to_install(scan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+    ran = run("check", scan, "--deep")
+    assert ran.exit_code == 2
+    assert 'pip install "advtex[worker]"' in ran.stderr
+    deep_answer(monkeypatch, hopeless=False, stdout="")
+    assert "the engine could not measure" in run("check", scan, "--deep").stderr

@@ -68,7 +68,7 @@ def test_a_stream_can_be_sent_again(scan: Path) -> None:
 
 def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
     with (
-        pytest.raises(ClientError, match=r"nowhere\.zip: No such file.*give a scan folder or zip"),
+        pytest.raises(ClientError, match=r"nowhere\.zip: No such file.*give a scan's folder or file"),
         packed(tmp_path / "nowhere.zip"),
     ):
         pass

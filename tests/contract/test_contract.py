@@ -36,6 +36,7 @@ def test_defaults_suit_most_scans() -> None:
         ("height", 64, 4096),
         ("steps", 1, 1_000_000),
         ("face_budget", 100, 2_000_000),
+        ("max_views", 2, 2_000),
         ("max_texture_size", 256, 16384),
         ("holdout", 2, 1000),
         ("seed", 0, 2**31 - 1),

@@ -67,8 +67,14 @@ def test_a_scan_becomes_a_model_through_a_kill_and_everything_stops(
         assert done.progress.step == done.progress.steps == 200
         paths = client.download_results(done, tmp_path / "out")
     names = {path.relative_to(tmp_path / "out").as_posix() for path in paths}
-    assert {"model.obj", "model.mtl", "model.png", "model.glb", "report.json"} <= names
-    assert any(name.startswith("previews/") for name in names)
+    assert {"model.obj", "model.mtl", "model.png", "model.glb", "report.json", "index.html"} <= names
+    manifest = json.loads((tmp_path / "out" / "previews" / "manifest.json").read_text())
+    pictures = [view[kind] for view in manifest["views"] for kind in ("photo", "render", "mean")]
+    assert {*pictures, *manifest["turntable"], *manifest["atlas"], manifest["thumbnail"]} <= names
+    curves = json.loads((tmp_path / "out" / manifest["curves"]).read_text())
+    assert curves["steps"] == list(range(1, 201)), "also of the attempt that was killed"
+    assert curves["quality"]["steps"][-1] == 200
+    assert set(done.progress.stage_peak_bytes) == set(done.progress.stage_seconds)
     assert (tmp_path / "out" / "model.glb").read_bytes()[:4] == b"glTF"
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["heldout"], "two views were held out and not scored"

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from advtex_engine.depth import ROTATED, DepthEncoding, Raw, depth_in_color_image, inflate, measure_depth
+from advtex_engine.depth import PLAIN, ROTATED, DepthEncoding, Raw, depth_in_color_image, inflate, measure_depth
 from advtex_engine.errors import Problem
 from advtex_engine.monitor import Monitor
 from advtex_engine.scene import Camera, Mesh
@@ -71,19 +71,14 @@ def test_rotated_tenths_of_a_millimetre_end_at_six_metres() -> None:
     np.testing.assert_allclose(tenths.metres(stored(depth, tenths)), [[0.5, 5.9999, 6.0, 0, 0]], rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("true", "warns"),
-    [
-        (MILLIMETRES, False),
-        (DepthEncoding("rotated mm", 1000.0, rotated=True), True),
-        (DepthEncoding("rotated 0.1 mm", 10_000.0, rotated=True), True),
-    ],
-)
-def test_the_encoding_is_measured(true: DepthEncoding, warns: bool) -> None:
+@pytest.mark.parametrize("true", [*PLAIN, *ROTATED], ids=lambda encoding: encoding.name)
+@pytest.mark.parametrize("declared", [MILLIMETRES, PLAIN[1], ROTATED[0]], ids=lambda encoding: encoding.name)
+def test_the_encoding_is_measured(true: DepthEncoding, declared: DepthEncoding) -> None:
     listener = Listener()
     noise = np.random.default_rng(0).normal(1, 0.01, (48, 64))
     samples = [(camera(), stored(wall_depth(camera()) * noise, true))]
-    found = measure_depth(wall(), samples, MILLIMETRES, listener)
+    found = measure_depth(wall(), samples, declared, listener)
+    warns = (true.units_per_metre, true.rotated) != (declared.units_per_metre, declared.rotated)
     assert found is not None
     assert (found.units_per_metre, found.rotated) == (true.units_per_metre, true.rotated)
     assert [problem.code for problem in listener.warnings] == (["depth_encoding"] if warns else [])

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from advtex_engine.bench import discriminator_flops, step_flops
+from advtex_engine.bench_counts import discriminator_flops, step_flops
 from advtex_engine.discriminator import PATCH_OFFSET, PATCH_STRIDE, RECEPTIVE_FIELD, PatchDiscriminator, patch_shares
 from advtex_engine.losses import adversarial_loss, discriminator_loss, l1_loss, masked_mean, patch_masks
 
@@ -22,6 +22,15 @@ def test_parameters_and_initialization() -> None:
     weights = torch.cat([p.detach().flatten() for p in network.parameters() if p.ndim == 4])
     assert abs(weights.std().item() - 0.02) < 2e-4
     assert all(p.abs().max() == 0 for p in network.parameters() if p.ndim == 1)
+
+
+def test_two_more_channels_of_zeros_change_neither_logits_nor_gradients() -> None:
+    network, x = discriminator(), torch.randn(1, 6, 40, 48, generator=torch.Generator().manual_seed(1))
+    padded = torch.cat((x, torch.zeros(1, 2, 40, 48)), 1)
+    results = [network.examine(image) for image in (x, padded)]
+    torch.testing.assert_close(results[0], results[1], atol=1e-5, rtol=1e-4)
+    plain, wide = (torch.autograd.grad(logits.sum(), list(network.parameters())) for logits, _ in results)
+    torch.testing.assert_close(plain, wide, atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize(("width", "height"), [(160, 120), (97, 131), (24, 24), (288, 208)])

@@ -239,6 +239,12 @@ def test_holdout_takes_the_frames_that_texturing_leaves_out(scan: Path, model: P
         evaluate(model, scan, holdout=1)
 
 
+def test_the_layout_can_be_told(scan: Path, model: Path) -> None:
+    assert evaluate(model, scan, holdout=FRAMES, layout="native").mean["views"] == 1
+    with pytest.raises(ScanError):
+        evaluate(model, scan, holdout=FRAMES, layout="tum")
+
+
 def test_size_is_that_of_renders_and_photographs(scan: Path, model: Path, tmp_path: Path) -> None:
     evaluate(model, scan, size=(80, 64), holdout=FRAMES, sheet=tmp_path / "sheet.png")
     sheet = cv2.imread(str(tmp_path / "sheet.png"))

@@ -59,6 +59,18 @@ def plane(side: int) -> tuple[Atlas, torch.Tensor]:
     return Atlas(Mesh(v_pos, faces, uv, faces), 8, 8, "xatlas", 1), torch.full((8, 8, 3), 90, dtype=torch.uint8)
 
 
+def in_pages(atlas: Atlas, texture: torch.Tensor) -> tuple[Atlas, torch.Tensor]:
+    """The same surface on 2 x 2 pages, each of which has the whole texture and every fourth face."""
+    mesh = atlas.mesh
+    assert mesh.v_uv is not None
+    assert mesh.t_uv_idx is not None
+    number = torch.arange(len(mesh.t_uv_idx)) % 4
+    cell = torch.stack((number % 2, number // 2), 1)[:, None]
+    v_uv = ((mesh.v_uv[mesh.t_uv_idx].clamp(1e-6, 1 - 1e-6) + cell) / 2).view(-1, 2)
+    paged = Mesh(mesh.v_pos, mesh.t_pos_idx, v_uv, torch.arange(len(v_uv)).view(-1, 3))
+    return Atlas(paged, 2 * atlas.width, 2 * atlas.height, "xatlas", 4, 2), texture.repeat(2, 2, 1)
+
+
 def camera_on_globe() -> Camera:
     """Looks along -x and a little down at the globe of `globe`."""
     eye, target = np.array([6.0, -1.2, 2.0]), np.array([3.0, -2.0, 1.0])
@@ -159,6 +171,22 @@ def test_other_loaders_show_the_same_image(tmp_path: Path, suffix: str) -> None:
     assert np.quantile(difference, 0.999) < 3
 
 
+@pytest.mark.parametrize("suffix", ["obj", "glb"])
+def test_other_loaders_find_every_page(tmp_path: Path, suffix: str) -> None:
+    atlas, texture = in_pages(*globe())
+    export_model(tmp_path, atlas, texture, up_axis="+y")
+    scene = trimesh.load_scene(tmp_path / f"model.{suffix}")
+    parts = list(scene.geometry.values())
+    assert len(parts) == 4
+    assert sum(len(part.faces) for part in parts) == len(atlas.mesh.t_pos_idx)
+    for part in parts:
+        material = part.visual.material
+        image = material.image if suffix == "obj" else material.baseColorTexture
+        assert np.array_equal(np.asarray(image), texture[: atlas.height // 2, : atlas.width // 2].numpy())
+        assert part.visual.uv.min() >= 0
+        assert part.visual.uv.max() <= 1
+
+
 def test_obj_keeps_positions_bit_for_bit_and_faces_in_order(tmp_path: Path) -> None:
     atlas, texture = globe()
     export_model(tmp_path, atlas, texture, up_axis="-y", name="thing")
@@ -250,9 +278,9 @@ def validate(folder: Path, model: Path) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("up_axis", ["+z", "-x", "+y"])
-@pytest.mark.parametrize("model", ["globe", "plane"])
+@pytest.mark.parametrize("model", ["globe", "plane", "pages"])
 def test_khronos_validator_finds_nothing(tmp_path: Path, validator: Path, up_axis: str, model: str) -> None:
-    atlas, texture = globe() if model == "globe" else plane(256)
+    atlas, texture = {"globe": globe, "plane": lambda: plane(256), "pages": lambda: in_pages(*globe())}[model]()
     export_model(tmp_path, atlas, texture, up_axis=up_axis)
     report = validate(validator, tmp_path / "model.glb")
     assert [issue for issue in report["issues"]["messages"] if issue["severity"] < 2] == []

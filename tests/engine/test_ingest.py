@@ -17,9 +17,10 @@ import pytest
 import torch
 
 from advtex_engine.config import TextureConfig
+from advtex_engine.decode import decode_color, decode_depth
 from advtex_engine.depth import DepthEncoding, depth_in_color_image
 from advtex_engine.errors import Problem, ScanError
-from advtex_engine.ingest import decode_color, decode_depth, ingest
+from advtex_engine.ingest import ingest
 from advtex_engine.monitor import Monitor
 from advtex_engine.rasterize import rasterize
 from advtex_scan.manifest import ByteRange, Intrinsics

@@ -18,6 +18,7 @@ from advtex_engine.config import METHODS as METHOD_NAMES
 from advtex_engine.config import PRESETS, PyramidLevel, TextureConfig
 from advtex_engine.discriminator import PatchDiscriminator
 from advtex_engine.errors import Stopped
+from advtex_engine.live import Live
 from advtex_engine.methods import METHODS, MethodInput, descent
 from advtex_engine.methods.best_view import label_faces
 from advtex_engine.methods.mean import mean_texture
@@ -77,8 +78,9 @@ def task(
     maps = build_view_maps(atlas, views, "scene")
     listener = monitor or Monitor()
     preset = replace(PRESETS["paper"], levels=(PyramidLevel(3),), start="mean")
+    scene = Scene(atlas.mesh, views)
     return MethodInput(
-        Scene(atlas.mesh, views),
+        scene,
         atlas,
         {1: maps},
         {1: mean_texture(maps)},
@@ -86,6 +88,7 @@ def task(
         TextureConfig(**config),  # type: ignore[arg-type]  # keywords of one test each
         listener,
         WorkFolder(work, "", listener),
+        Live(scene, atlas, listener),
     )
 
 

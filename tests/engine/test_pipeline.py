@@ -17,7 +17,7 @@ import torch
 from advtex_engine.checkpoint import WorkFolder
 from advtex_engine.config import PRESETS, TextureConfig
 from advtex_engine.errors import OptionError, Problem, ScanError, Stopped
-from advtex_engine.monitor import STAGES, Monitor
+from advtex_engine.monitor import STAGES, Glimpse, Monitor
 from advtex_engine.pipeline import choose_device, resolve_preset, texture_scan
 from advtex_engine.report import Stages, WarningKeeper
 from advtex_engine.synthesize import synthesize
@@ -33,6 +33,7 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+WITH_MESH = tuple(stage for stage in STAGES if stage != "fusion")  # of scans that bring a mesh
 CONFIG = TextureConfig(preset="standard", steps=STEPS, holdout=6, face_budget=4000, device="cpu")
 
 
@@ -44,8 +45,11 @@ class Recorder(Monitor):
         self.steps: list[int] = []
         self.files: set[str] = set()
         self.problems: list[Problem] = []
+        self.glimpses: list[Glimpse] = []
 
-    def stage_finished(self, stage: str, seconds: float, peak_memory_bytes: int) -> None:
+    def stage_finished(
+        self, stage: str, seconds: float, peak_memory_bytes: int, peak_device_memory_bytes: int | None
+    ) -> None:
         assert seconds >= 0
         assert peak_memory_bytes > 2**20
         self.stages.append(stage)
@@ -55,6 +59,9 @@ class Recorder(Monitor):
         assert steps == STEPS
         self.steps.append(step)
         self.step = step
+
+    def glimpsed(self, glimpse: Glimpse) -> None:
+        self.glimpses.append(glimpse)
 
     def warning(self, problem: Problem) -> None:
         self.problems.append(problem)
@@ -78,18 +85,27 @@ def whole(scan: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, R
 
 def test_a_run_leaves_models_previews_and_a_report(whole: tuple[Path, Recorder]) -> None:
     out, recorder = whole
-    assert tuple(recorder.stages) == STAGES
+    assert tuple(recorder.stages) == WITH_MESH
     assert recorder.steps == list(range(1, STEPS + 1))
     for name in ("model.obj", "model.mtl", "model.png", "model.glb", "previews/comparison.png", "previews/sheet.png"):
         assert (out / name).stat().st_size > 50, name
+    manifest = json.loads((out / "previews/manifest.json").read_text())
+    assert [view["heldout"] for view in manifest["views"]].count(True) == 2
+    curves = json.loads((out / manifest["curves"]).read_text())
+    assert curves["steps"] == list(range(1, STEPS + 1))
+    shown = [glimpse.step for glimpse in recorder.glimpses]  # on a busy machine there is time for more than the last
+    assert curves["quality"]["steps"] == shown == sorted(set(shown))
+    assert shown[-1] == STEPS
+    assert "<title>Textured model</title>" in (out / "index.html").read_text()
     report = json.loads((out / "report.json").read_text())
-    assert [stage["stage"] for stage in report["stages"]] == list(STAGES)
+    assert [stage["stage"] for stage in report["stages"]] == list(WITH_MESH)
     assert report["losses"][-1]["step"] == STEPS
     assert report["scan"]["heldout"] == sorted(report["scan"]["heldout"])
     assert len(report["scan"]["heldout"]) == 2
     assert report["scan"]["views"] == 10
     assert set(report["heldout"]) == {"texture", "mean"}
     assert report["options"]["steps"] == STEPS
+    assert {"graph", "steps_per_launch", "kernels", "precision", "reasons"} <= set(report["step"])
     assert report["versions"]["torch"].startswith("2.")
 
 
@@ -107,7 +123,7 @@ def test_a_stopped_run_resumes_to_the_same_bytes_without_redoing_earlier_stages(
     assert (tmp_path / "model.png").read_bytes() == (whole[0] / "model.png").read_bytes()
     report = json.loads((tmp_path / "report.json").read_text())
     resumed = [stage["stage"] for stage in report["stages"] if stage["resumed"]]
-    assert resumed == ["ingest", "geometry", "refinement", "atlas"]
+    assert resumed == ["ingest", "conventions", "geometry", "refinement", "atlas"]
     (optimization,) = [stage["seconds"] for stage in report["stages"] if stage["stage"] == "optimization"]
     assert first > 0.01
     assert optimization == pytest.approx(first + again.seconds["optimization"], abs=0.002)
@@ -128,7 +144,7 @@ def test_without_resume_and_with_other_options_the_work_folder_is_not_used(
 
 @pytest.mark.slow
 def test_a_killed_run_resumes_bit_identical(scan: Path, tmp_path: Path) -> None:
-    arguments = [sys.executable, "-m", "advtex_engine", "texture", str(scan), "--preset", "standard", "--steps", "200"]
+    arguments = [sys.executable, "-m", "advtex_engine", "texture", str(scan), "--preset", "standard", "--steps", "80"]
     arguments += ["--face-budget", "4000", "--device", "cpu"]
     environment = {**os.environ, "OMP_NUM_THREADS": "2"}
     subprocess.run([*arguments, "-o", str(tmp_path / "whole")], check=True, env=environment, capture_output=True)

@@ -14,6 +14,7 @@ from torch import Tensor
 from advtex_engine.checkpoint import WorkFolder
 from advtex_engine.config import METHODS as METHOD_NAMES
 from advtex_engine.config import PRESETS, TextureConfig
+from advtex_engine.live import Live
 from advtex_engine.methods import METHODS, MethodInput
 from advtex_engine.methods.view_selection import Selection, select_views, view_selection
 from advtex_engine.metrics import gradient_ratio
@@ -67,8 +68,8 @@ def given(tmp_path: Path, views: list[View], atlas: Atlas | None = None) -> Meth
     scene = Scene(atlas.mesh, tuple(views), kind="object")
     maps = {1: build_view_maps(atlas, scene.views, scene.kind)}
     monitor = Monitor()
-    work = WorkFolder(tmp_path / "work", "test", monitor)
-    return MethodInput(scene, atlas, maps, {}, PRESETS["standard"], TextureConfig(), monitor, work)
+    work, live = WorkFolder(tmp_path / "work", "test", monitor), Live(scene, atlas, monitor)
+    return MethodInput(scene, atlas, maps, {}, PRESETS["standard"], TextureConfig(), monitor, work, live)
 
 
 def good_views(atlas: Atlas) -> list[View]:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from advtex_engine.cameras import project, unproject
+from advtex_engine.pipeline import shrink
+from advtex_engine.refine_points import surface_depths
 from advtex_engine.reproject import reproject, unproject_pixels
 from advtex_engine.scene import Atlas, Camera, Mesh, View
 from advtex_engine.texture import decode_uv
@@ -33,7 +37,7 @@ def camera_at(x: float, turn: float = 0.0) -> Camera:
     return Camera(K, torch.linalg.inv(pose), WIDTH, HEIGHT)
 
 
-def maps_of(cameras: list[Camera], depth: torch.Tensor | None = None) -> ViewMaps:
+def maps_of(cameras: list[Camera], depth: torch.Tensor | None = None, mask: torch.Tensor | None = None) -> ViewMaps:
     """Every view's color codes its pixels: red = column, green = row, blue = view."""
     mesh = scene_mesh()
     views = []
@@ -42,8 +46,31 @@ def maps_of(cameras: list[Camera], depth: torch.Tensor | None = None) -> ViewMap
         color[..., 0] = torch.arange(WIDTH)
         color[..., 1] = torch.arange(HEIGHT)[:, None]
         color[..., 2] = index
-        views.append(View(f"view{index}", camera, color, depth))
+        views.append(View(f"view{index}", camera, color, depth, mask))
     return build_view_maps(Atlas(mesh, 256, 256, "scan", 2), tuple(views), "object")
+
+
+def test_what_a_mask_leaves_out_is_background() -> None:
+    mask = torch.rand(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0)) < 0.5
+    whole, masked = (maps_of([camera_at(0.0)], mask=given).depth.view(HEIGHT, WIDTH) for given in (None, mask))
+    assert torch.equal(masked, torch.where(mask, whole, 0))
+    assert (masked > 0).any()
+
+
+def test_a_smaller_view_uses_what_all_of_its_pixels_allow() -> None:
+    mask = torch.rand(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0)) < 0.8
+    view = View("view", camera_at(0.0), torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8), mask=mask)
+    small = shrink(view, 2)
+    rows, columns = torch.arange(HEIGHT // 2)[:, None] * 2, torch.arange(WIDTH // 2) * 2
+    allowed = mask[rows, columns] & mask[rows + 1, columns] & mask[rows, columns + 1] & mask[rows + 1, columns + 1]
+    assert small.mask is not None
+    assert torch.equal(small.mask, allowed)
+    size = (WIDTH // 2, HEIGHT // 2)
+    whole, masked = (
+        surface_depths(scene_mesh(), (given,), size, "object")[1][0] for given in (replace(view, mask=None), view)
+    )
+    assert torch.equal(masked, torch.where(allowed, whole, 0))
+    assert (masked > 0).any()
 
 
 def test_uv_and_depth_are_those_of_the_surface_point_at_each_pixel_center() -> None:

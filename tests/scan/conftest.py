@@ -6,6 +6,7 @@ import json
 import math
 import os
 import struct
+import sys
 import zipfile
 import zlib
 from dataclasses import dataclass, field
@@ -13,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
 WIDTH, HEIGHT = 32, 24
 INTRINSICS = {"fx": 30.0, "fy": 30.0, "cx": 16.0, "cy": 12.0, "width": WIDTH, "height": HEIGHT}

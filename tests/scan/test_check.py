@@ -38,6 +38,8 @@ def frame(maker, index):
 
 def no_mesh(maker, make):
     del maker.scan["mesh"]
+    for frame in maker.scan["frames"]:
+        del frame["depth"]
 
 
 def mesh_not_there(maker, make):
@@ -348,7 +350,7 @@ def test_broken_json_says_where(maker):
 def test_a_report_is_json_and_text(maker):
     maker.native()
     maker.scan["frames"][0]["camera_to_world"] = [None] * 16
-    del maker.scan["mesh"]
+    no_mesh(maker, None)
     report = check_scan(maker.folder())
     as_json = json.loads(json.dumps(report.to_dict(), allow_nan=False))
     assert as_json["ok"] is False
@@ -357,7 +359,8 @@ def test_a_report_is_json_and_text(maker):
     assert set(as_json["findings"][0]) == {"severity", "code", "where", "message", "remedy"}
     text = report.format_text()
     assert "4 usable of 5 (left out: 1 lost tracking)" in text
-    assert "error    there is no mesh" in text
+    assert "layout   native, 100% sure: scan.json is there" in text
+    assert "error    there is neither a mesh nor depth" in text
     assert text.endswith("this scan cannot be textured as it is")
 
 

@@ -68,6 +68,7 @@ def bad_png(**fields: int) -> bytes:
     [
         (b"", "is empty"),
         (b"hello world" * 100, "neither PNG nor JPEG"),
+        (b"\x76\x2f\x31\x01\x02\0\0\0", "OpenEXR"),
         (bad_png()[:30], "cut off"),
         (bad_png(width=0), "makes no sense"),
         (bad_png(bits=3), "makes no sense"),

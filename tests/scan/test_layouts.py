@@ -311,6 +311,22 @@ def test_sens_frames_are_ranges_of_the_stream(sens, make):
         assert zlib.decompress(archive.read(frame.depth)) == bytes(32 * 24 * 2)
 
 
+def test_a_lone_sens_is_a_scan_whatever_it_is_called(sens, make, tmp_path):
+    path = tmp_path / "as-a-server-stores-it.zip"
+    path.write_bytes(sens.files["scene0001_00.sens"])
+    del sens.files["scene0001_00_vh_clean_2.ply"]
+    with open_scan(path) as lone, open_scan(sens.zip()) as packed:
+        assert lone.names() == ("scan.sens",)
+        assert lone.stamps()[0][1:] == packed.stamps()[0][1:]
+        frames = [read_scan(archive).manifest.frames for archive in (lone, packed)]
+        assert len(frames[0]) == len(frames[1]) > 0
+        for one, same in zip(*frames, strict=True):
+            assert one.camera_to_world == same.camera_to_world
+            assert lone.read(one.color) == packed.read(same.color)
+    path.write_bytes(path.read_bytes()[:-200])
+    assert "truncated_file" in [one.code for one in reading(path).report.findings if one.severity == "error"]
+
+
 def test_sens_of_raw_images(sens, make):
     sens.files["scene0001_00.sens"] = sens_bytes(make, color=0, depth=0)
     found = reading(sens.folder())

@@ -17,6 +17,7 @@ from advtex_server.settings import ServerSettings
 
 TESTS = Path(__file__).parents[1]
 NAN = math.nan
+pytestmark = pytest.mark.one_machine("what is in a scan is judged alike wherever it lies")
 
 
 @pytest.fixture(scope="module")

@@ -43,6 +43,7 @@ def test_a_job_by_reference(live: Any, scans: Path, is_error: Any) -> None:
     assert live.store.uploads.expected_bytes() == 0
 
 
+@pytest.mark.one_machine("pure validation")
 @pytest.mark.parametrize("source", ["file:///etc", "file:///etc/passwd", "http://127.0.0.1/", "s3://bucket/x", ""])
 def test_what_may_not_be_read_is_refused(live: Any, is_error: Any, source: str) -> None:
     response = live.http.post("/v1/jobs", json={"source": source})
@@ -51,11 +52,13 @@ def test_what_may_not_be_read_is_refused(live: Any, is_error: Any, source: str) 
     assert live.http.get("/v1/jobs").json()["jobs"] == []
 
 
+@pytest.mark.one_machine("pure validation")
 def test_what_is_not_there_is_named(live: Any, scans: Path, is_error: Any) -> None:
     response = live.http.post("/v1/jobs", json={"source": f"{scans.as_uri()}/none"})
     assert "nothing at" in is_error(response, 422, "invalid_source")
 
 
+@pytest.mark.one_machine("pure validation")
 @pytest.mark.parametrize("spec", [{}, {"upload_id": "x", "source": "file:///x"}, {"upload_id": "x", "batch": "a b"}])
 def test_one_scan_and_a_plain_name_are_needed(live: Any, is_error: Any, spec: dict[str, str]) -> None:
     is_error(live.http.post("/v1/jobs", json=spec), 422, "bad_request")
@@ -99,6 +102,7 @@ def test_a_batch_from_beginning_to_end(live: Any, scans: Path, is_error: Any) ->
     assert [b["id"] for b in live.http.get("/v1/batches").json()["batches"]] == ["night"]
 
 
+@pytest.mark.one_machine("tests/store has the same on both databases")
 def test_batches_belong_to_their_owner(live: Any, scans: Path, is_error: Any) -> None:
     live.http.post("/v1/jobs", json={"source": (scans / "good").as_uri(), "batch": "night"})
     with live.client(live.store.accounts.create_key("other")) as other:

@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 
 from advtex_server import embedded
 from advtex_server.children import Child
-from advtex_server.embedded import SetupError, only_one, redis_binary, write_private
+from advtex_server.embedded import SetupError, free_port, only_one, redis_binary, write_private
 from advtex_server.main import app
 
 COMMAND = [sys.executable, "-m", "advtex_server.main"]
@@ -111,7 +111,10 @@ def up(tmp_path: Path) -> Iterator[Up]:
 
 def test_up(up: Up, tmp_path: Path, scan_zip: Path) -> None:
     """One command: everything runs, is private, is told to clients, and ends in order."""
+    page = up.ready.pop("page")
     assert up.ready == {"event": "ready", "url": up.client["url"], "data_dir": str(up.data), "pid": up.process.pid}
+    assert "Sign out" in httpx.get(page, follow_redirects=True).text, "the printed link signs a browser in"
+    assert httpx.get(page).status_code == 401, "once"
     for private in ("client.json", "redis/password"):
         assert stat.S_IMODE((up.data / private).stat().st_mode) == 0o600
     until(up.worker_pid)
@@ -148,6 +151,14 @@ def test_children_that_die_are_started_again(up: Up) -> None:
     redis.kill()
     until(lambda: not redis.is_running())
     until(lambda: up.http.get("/readyz").json()["checks"]["redis"]["ok"])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems keep their range elsewhere")
+def test_no_outgoing_connection_gets_the_port_of_a_redis_that_is_started_again() -> None:
+    lowest_outgoing = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text().split()[0])
+    if lowest_outgoing <= 20_000:
+        pytest.skip(f"this system gives outgoing connections every port from {lowest_outgoing}")
+    assert all(free_port() < lowest_outgoing for _ in range(100))
 
 
 def test_children_die_with_the_service(up: Up) -> None:
@@ -278,9 +289,9 @@ def test_a_child_that_does_not_stop_is_killed_with_its_own_children() -> None:
 
 def test_a_child_that_keeps_dying_is_started_ever_more_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [1000.0]
+    monkeypatch.setattr("advtex_server.children.time.monotonic", lambda: now[0])
     child = Child("dying", ["true"], dict(os.environ), stop_seconds=1)
     child.start()
-    monkeypatch.setattr("advtex_server.children.time.monotonic", lambda: now[0])
     pauses = []
     for _ in range(6):
         assert child._process is not None

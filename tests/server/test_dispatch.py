@@ -16,7 +16,6 @@ from advtex_server.dispatch import Dispatcher
 from advtex_server.service import IN_LINE, job_view
 from advtex_server.settings import ServerSettings
 from advtex_store import keys
-from advtex_store.database import upgrade_database
 from advtex_store.queue import PRESENCE, queue_name
 from advtex_store.store import Store, open_store
 
@@ -231,6 +230,7 @@ def test_nothing_ends_the_loop(store: Store, monkeypatch: pytest.MonkeyPatch) ->
     asyncio.run(asyncio.wait_for(run(), 10))
 
 
+@pytest.mark.one_machine("the queue is the same")
 def test_jobs_are_accepted_while_redis_is_away_and_start_when_it_is_back(
     make_live: Callable[..., Any], own_redis: Any, scan_zip: Path
 ) -> None:
@@ -255,15 +255,3 @@ def test_jobs_are_accepted_while_redis_is_away_and_start_when_it_is_back(
     own_redis.start()  # empty: what was in it is gone
     only_workers(live.store, GIB, GIB)
     until(lambda: in_redis(live.store) == [f"{first}-1", f"{second}-1"])
-
-
-def test_the_whole_api_on_postgresql(
-    make_live: Callable[..., Any], postgres_url: str, redis_url: str, scan_zip: Path, tmp_path: Path
-) -> None:
-    upgrade_database(postgres_url.replace("postgresql:", "postgresql+psycopg:"))
-    live = make_live(database_url=postgres_url, redis_url=redis_url)
-    (tmp_path / "a.glb").write_bytes(b"glb")
-    job = live.finished_job(scan_zip, {"a.glb": tmp_path / "a.glb"})
-    assert live.http.get(f"/v1/jobs/{job}/results/a.glb").content == b"glb"
-    assert '"succeeded"' in live.http.get(f"/v1/jobs/{job}/events").text
-    assert live.http.delete(f"/v1/jobs/{job}").status_code == 204

@@ -20,6 +20,7 @@ def test_every_code_has_a_status() -> None:
     assert all(400 <= status < 600 for status in STATUS.values())
 
 
+@pytest.mark.one_machine("pure validation")
 def test_every_refusal_has_the_one_body(live: Any, is_error: Any) -> None:
     http = live.http
     is_error(http.get("/nowhere"), 404, "not_found")
@@ -32,12 +33,40 @@ def test_every_refusal_has_the_one_body(live: Any, is_error: Any) -> None:
         is_error(http.get("/v1/nowhere", headers={"Authorization": header}), 401, "unauthorized")
 
 
+@pytest.mark.one_machine("pure validation")
 def test_bodies_are_small(make_live: Callable[..., Any], is_error: Any) -> None:
     live = make_live(max_body_bytes=1000)
     is_error(live.http.post("/v1/jobs", content=b" " * 1001), 413, "too_large")
     is_error(live.http.post("/v1/jobs", content=iter([b" " * 600] * 2)), 413, "too_large")
 
 
+def test_odd_characters_are_no_failure(live: Any, is_error: Any) -> None:
+    """PostgreSQL's text has no NUL."""
+    for method, path in (
+        ("GET", "/v1/jobs/%00"),
+        ("GET", "/v1/jobs/%00/events"),
+        ("GET", "/v1/jobs/%00/results/x"),
+        ("DELETE", "/v1/jobs/%00"),
+        ("POST", "/v1/jobs/%00/retry"),
+        ("GET", "/v1/uploads/%00"),
+        ("DELETE", "/v1/uploads/%00"),
+        ("GET", "/v1/batches/%00"),
+        ("POST", "/v1/batches/%00/cancel"),
+        ("GET", "/v1/webhooks/%00"),
+        ("GET", "/v1/jobs?label=%00"),
+        ("GET", "/v1/jobs?batch=%00"),
+    ):
+        is_error(live.http.request(method, path), 422, "bad_request")
+    for spec in ({"upload_id": "\0"}, {"upload_id": "x", "label": "\0"}, {"upload_id": "x", "batch": "\0"}):
+        is_error(live.http.post("/v1/jobs", json=spec), 422, "bad_request")
+    is_error(live.http.post("/v1/jobs", json={"source": "file:///%00"}), 422, "invalid_source")
+    is_error(live.http.post("/v1/webhooks", json={"url": "https://1.1.1.1/\0"}), 422, "bad_request")
+    upload = live.http.post("/v1/uploads", content=b"x", headers={"X-Filename": "a%00%F0%9F%AA%91b"})
+    assert upload.json()["filename"] == "a\U0001fa91b"
+    assert live.job(upload.json()["id"], label="\U0001fa91")["label"] == "\U0001fa91"
+
+
+@pytest.mark.one_machine("pure validation")
 def test_what_goes_wrong_inside_is_not_told(live: Any, is_error: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object) -> None:
         raise RuntimeError("secret")
@@ -56,15 +85,24 @@ def test_health(live: Any, tmp_path: Path) -> None:
     assert "jobs are accepted and wait" in checks["redis"]["message"]
 
 
+def spoil(live: Any) -> None:
+    """Puts another file in the place of the database: SQLite maps its files, and cutting one short would kill us."""
+    database = live.settings.data_dir / "advtex.db"
+    (live.settings.data_dir / "other").write_bytes(b"no database any more" * 100)
+    (live.settings.data_dir / "other").replace(database)
+    for suffix in ("-wal", "-shm"):
+        database.with_name(database.name + suffix).unlink(missing_ok=True)
+    live.store.database.engine.dispose()  # after it, so that nobody goes on with the one before
+
+
+@pytest.mark.one_machine("spoils the database's file")
 def test_readyz_says_what_is_wrong(live: Any) -> None:
     settings = live.settings.model_copy(update={"disk_reserve_bytes": 1 << 60})
     live.app.state.service.settings = settings
     live.store.blobs.spool_dir.mkdir(parents=True, exist_ok=True)
     live.store.blobs.spool_dir.rmdir()
     live.store.blobs.spool_dir.write_text("in the way")
-    live.store.database.engine.dispose()
-    for suffix in ("", "-wal", "-shm"):
-        (live.settings.data_dir / f"advtex.db{suffix}").write_bytes(b"no database any more" * 100)
+    spoil(live)
     response = live.http.get("/readyz")
     assert response.status_code == 503
     body = response.json()
@@ -77,16 +115,16 @@ def test_readyz_says_what_is_wrong(live: Any) -> None:
     assert "make room" in live.http.get("/readyz").json()["checks"]["disk"]["message"]
 
 
+@pytest.mark.one_machine("spoils the database's file")
 def test_a_database_that_is_away_is_unavailable(live: Any, is_error: Any) -> None:
-    live.store.database.engine.dispose()
-    for suffix in ("", "-wal", "-shm"):
-        (live.settings.data_dir / f"advtex.db{suffix}").write_bytes(b"no database any more" * 100)
+    spoil(live)
     response = live.http.get("/v1/jobs")
     is_error(response, 503, "unavailable")
     assert response.headers["retry-after"] == "5"
     is_error(live.http.post("/v1/uploads", content=b"x"), 503, "unavailable")
 
 
+@pytest.mark.one_machine("tests/store has the same on both databases")
 def test_metrics(live: Any) -> None:
     live.job(live.upload())
     for number in range(3):
@@ -134,6 +172,7 @@ def test_metrics_of_the_fleet(make_live: Callable[..., Any], redis_url: str, sca
     assert 'advtex_jobs_ended_total{state="succeeded"} 1.0' in told
 
 
+@pytest.mark.one_machine("tests/store has the same on both databases")
 def test_readyz_tells_of_workers_that_pause(make_live: Callable[..., Any], redis_url: str, scan_zip: Path) -> None:
     live = make_live(redis_url=redis_url)
     job = live.job(live.upload(scan_zip.read_bytes()))["id"]

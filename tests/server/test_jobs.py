@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
 from advtex_contract.jobs import JobError, JobPage, JobView, Progress
 from advtex_server.events import FRESH_SECONDS, Lookout
@@ -46,6 +48,7 @@ def test_a_bad_scan_is_rejected_with_every_finding(live: Any, is_error: Any) -> 
     is_error(live.http.post(f"/v1/jobs/{job.id}/retry"), 409, "conflict")
 
 
+@pytest.mark.one_machine("pure validation")
 def test_options_out_of_bounds(live: Any, is_error: Any) -> None:
     upload = live.upload()
     for options in ({"steps": 0}, {"preset": "fastest"}, {"wdith": 3}, {"width": 5000}):
@@ -122,6 +125,7 @@ def test_lists(live: Any, scan_zip: Path, is_error: Any) -> None:
         is_error(live.http.get("/v1/jobs", params=params), 422, "bad_request")
 
 
+@pytest.mark.one_machine("tests/store has the same on both databases")
 def test_other_owners_find_nothing(live: Any, scan_zip: Path, is_error: Any, tmp_path: Path) -> None:
     (tmp_path / "model.glb").write_bytes(b"glb")
     job = live.finished_job(scan_zip, {"model.glb": tmp_path / "model.glb"})
@@ -247,6 +251,7 @@ def test_a_result(live: Any, result: tuple[str, bytes], is_error: Any) -> None:
         is_error(live.http.get(url.replace("model.glb", name)), 404, "not_found")
 
 
+@pytest.mark.one_machine("tests/store cuts blobs of both storages")
 @pytest.mark.parametrize(
     ("header", "start", "end"),
     [
@@ -267,6 +272,7 @@ def test_ranges(live: Any, result: tuple[str, bytes], header: str, start: int, e
     assert response.headers["content-length"] == str(len(expected))
 
 
+@pytest.mark.one_machine("pure validation")
 @pytest.mark.parametrize("header", ["bytes=5-2", "bytes=-", "bytes=a-b", "items=0-1", "bytes=0-1,3-4", "bytes=²-3"])
 def test_ranges_that_are_ignored(live: Any, result: tuple[str, bytes], header: str) -> None:
     url, data = result
@@ -274,6 +280,7 @@ def test_ranges_that_are_ignored(live: Any, result: tuple[str, bytes], header: s
     assert (response.status_code, len(response.content)) == (200, len(data))
 
 
+@pytest.mark.one_machine("pure validation")
 @pytest.mark.parametrize("header", ["bytes=2560000-", "bytes=99999999-100000000", "bytes=-0"])
 def test_ranges_beyond_the_end(live: Any, result: tuple[str, bytes], header: str, is_error: Any) -> None:
     response = live.http.get(result[0], headers={"Range": header})
@@ -341,6 +348,22 @@ def test_many_callers_at_once(live: Any, scan_zip: Path) -> None:
     assert len(live.http.get("/v1/jobs").json()["jobs"]) == 24
 
 
+@pytest.mark.one_machine("the errors are made")
+def test_streams_outlast_a_database_in_trouble(live: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    job_id = live.job(live.upload())["id"]
+    read = live.store.records.job
+    troubles = iter([None, OperationalError("", {}, Exception("away")), PoolTimeoutError("all connections are in use")])
+
+    def troubled(*which: str) -> Any:
+        if (trouble := next(troubles, None)) is not None:
+            raise trouble
+        return read(*which)
+
+    monkeypatch.setattr(live.store.records, "job", troubled)
+    assert '"rejected"' in live.http.get(f"/v1/jobs/{job_id}/events").text
+
+
+@pytest.mark.one_machine("counts calls, whatever they read")
 def test_streams_of_one_job_share_a_look(live: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     job_id = live.job(live.upload())["id"]
     reads: list[str] = []

@@ -83,6 +83,7 @@ def test_no_key_is_no_guess() -> None:
     assert door.accounts.asked == 0
 
 
+@pytest.mark.one_machine("pure validation")
 def test_guessing_over_http(make_live: Callable[..., Any], is_error: Any) -> None:
     live = make_live(auth_failures_per_minute=3)
     with live.client("adv_000000000000_" + "a" * 40) as stranger:
@@ -93,6 +94,7 @@ def test_guessing_over_http(make_live: Callable[..., Any], is_error: Any) -> Non
         assert int(refused.headers["retry-after"]) > 0
 
 
+@pytest.mark.one_machine("pure validation")
 def test_behind_a_trusted_proxy_callers_have_addresses_of_their_own(make_live: Callable[..., Any]) -> None:
     """uvicorn trusts this machine by default; FORWARDED_ALLOW_IPS names others."""
     live = make_live(auth_failures_per_minute=1)
@@ -102,6 +104,7 @@ def test_behind_a_trusted_proxy_callers_have_addresses_of_their_own(make_live: C
     assert statuses == [401, 429, 401]
 
 
+@pytest.mark.one_machine("pure validation")
 def test_a_proxy_that_is_not_named_speaks_for_nobody(
     make_live: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -112,6 +115,7 @@ def test_a_proxy_that_is_not_named_speaks_for_nobody(
     assert statuses == [401, 429]
 
 
+@pytest.mark.one_machine("tests/store has the same on both databases")
 def test_scopes_and_expiry(live: Any, is_error: Any) -> None:
     accounts = live.store.accounts
     with live.client(accounts.create_key("r", owner="me", scopes=["read"])) as reader:
@@ -124,6 +128,7 @@ def test_scopes_and_expiry(live: Any, is_error: Any) -> None:
         is_error(expired.get("/v1/jobs"), 401, "unauthorized")
 
 
+@pytest.mark.one_machine("tests/store has the same on both databases")
 def test_a_key_can_be_asked_what_it_may_do(live: Any, is_error: Any, scan_zip: Path) -> None:
     end = int(time.time()) + 600
     key = live.store.accounts.create_key("w", owner="me", scopes=["write"], expires_at=end, max_active_jobs=3)
@@ -139,6 +144,7 @@ def test_a_key_can_be_asked_what_it_may_do(live: Any, is_error: Any, scan_zip: P
         is_error(stranger.get("/v1/key"), 401, "unauthorized")
 
 
+@pytest.mark.one_machine("tests/store has the same on both databases")
 def test_a_rotated_key_sees_the_same_jobs(live: Any, is_error: Any, scan_zip: Path) -> None:
     accounts = live.store.accounts
     old = accounts.create_key("mine", scopes=["read", "write"], max_active_jobs=1)

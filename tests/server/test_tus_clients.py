@@ -7,7 +7,6 @@ import json
 import os
 import shutil
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +39,6 @@ def stored(live: Any, url: str) -> bytes:
     return bytes(live.store.blobs.get(keys.scan_key(url.rpartition("/")[2])))
 
 
-@pytest.fixture(params=["folder", "s3"])
-def either(request: pytest.FixtureRequest, make_live: Callable[..., Any]) -> Any:
-    """A server with each of the two storages."""
-    return make_live() if request.param == "folder" else make_live(blob_url=request.getfixturevalue("s3_url"))
-
-
 @pytest.fixture
 def archive(tmp_path: Path) -> Path:
     path = tmp_path / "scan.zip"
@@ -53,8 +46,8 @@ def archive(tmp_path: Path) -> Path:
     return path
 
 
-def test_tuspy(either: Any) -> None:
-    client = TusClient(f"{either.url}/v1/uploads", headers={"Authorization": f"Bearer {either.key}"})
+def test_tuspy(live: Any) -> None:
+    client = TusClient(f"{live.url}/v1/uploads", headers={"Authorization": f"Bearer {live.key}"})
     settings: dict[str, Any] = {"chunk_size": 6_000_000, "metadata": {"filename": "scan.zip"}, "upload_checksum": True}
     first = client.uploader(file_stream=io.BytesIO(DATA), **settings)
     first.upload_chunk()
@@ -62,8 +55,8 @@ def test_tuspy(either: Any) -> None:
     again = client.uploader(file_stream=io.BytesIO(DATA), url=first.url, **settings)
     assert again.offset == 12_000_000
     again.upload()
-    assert stored(either, first.url) == DATA
-    stranger = TusClient(f"{either.url}/v1/uploads", headers={"Authorization": "Bearer wrong"})
+    assert stored(live, first.url) == DATA
+    stranger = TusClient(f"{live.url}/v1/uploads", headers={"Authorization": "Bearer wrong"})
     with pytest.raises(TusCommunicationError):
         stranger.uploader(file_stream=io.BytesIO(DATA)).upload()
 
@@ -85,19 +78,19 @@ def tus_js(request: pytest.FixtureRequest) -> Path:
 
 
 @pytest.mark.slow
-def test_tus_js_client(either: Any, archive: Path, tus_js: Path) -> None:
+def test_tus_js_client(live: Any, archive: Path, tus_js: Path) -> None:
     def run(*arguments: str) -> dict[str, Any]:
-        command = ["node", "upload.cjs", f"{either.url}/v1/uploads", either.key, str(archive), *arguments]
+        command = ["node", "upload.cjs", f"{live.url}/v1/uploads", live.key, str(archive), *arguments]
         done = subprocess.run(command, cwd=tus_js, capture_output=True, text=True, timeout=60)
         assert done.returncode == 0, done.stderr
         return dict(json.loads(done.stdout))
 
     whole = run("6000000")
     assert whole["accepted"] == [6_000_000, 12_000_000, 18_000_000, 20_000_000]
-    assert stored(either, whole["url"]) == DATA
-    assert either.http.get(whole["url"]).json()["filename"] == "scän.zip"
-    begun = create(either)
-    patch(either, begun, 0, DATA[:11_000_000])
-    resumed = run("6000000", f"{either.url}{begun}")
+    assert stored(live, whole["url"]) == DATA
+    assert live.http.get(whole["url"]).json()["filename"] == "scän.zip"
+    begun = create(live)
+    patch(live, begun, 0, DATA[:11_000_000])
+    resumed = run("6000000", f"{live.url}{begun}")
     assert resumed["accepted"] == [17_000_000, 20_000_000]
-    assert stored(either, begun) == DATA
+    assert stored(live, begun) == DATA

@@ -25,6 +25,7 @@ from advtex_server.targets import TargetRefused, TargetRules
 from advtex_store import webhooks as outbox
 
 LOOPBACK = [ip_network("127.0.0.0/8")]
+pytestmark = pytest.mark.one_machine("the outbox runs on both databases in tests/store")
 
 
 class Receiver:

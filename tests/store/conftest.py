@@ -77,3 +77,12 @@ def sqlite_bench(sqlite_url: str) -> Iterator[Bench]:
     database = Database(sqlite_url, clock)
     yield Bench(database, clock)
     database.close()
+
+
+@pytest.fixture
+def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of multipart uploads, for scans of a few bytes."""
+    import moto.s3.models
+
+    monkeypatch.setattr("advtex_store.s3_partial.PART", 8)
+    monkeypatch.setattr(moto.s3.models, "S3_UPLOAD_PART_MIN_SIZE", 8)

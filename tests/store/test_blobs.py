@@ -109,6 +109,25 @@ def test_only_one_of_many_creates(blobs: Blobs) -> None:
     assert list(blobs.spool_dir.glob("*")) == []
 
 
+def test_a_small_blob_that_is_being_replaced_is_read_whole(blobs: Blobs) -> None:
+    versions = [b"a" * 10, b"b" * 1000]
+    blobs.put("jobs/a/index.json", versions[0])
+    done = threading.Event()
+
+    def replace() -> None:
+        for number in range(60):
+            blobs.put("jobs/a/index.json", versions[number % 2])
+        done.set()
+
+    writer = threading.Thread(target=replace)
+    writer.start()
+    read = []
+    while not done.is_set():
+        read.append(blobs.get("jobs/a/index.json"))
+    writer.join()
+    assert set(read) == set(versions)
+
+
 def test_nothing_appears_without_commit(blobs: Blobs) -> None:
     with blobs.create("a/half") as writer:
         writer.write(b"x" * (3 * CHUNK))
@@ -198,6 +217,23 @@ def test_writing_and_deleting_in_one_folder(tmp_path: Path) -> None:
     for thread in threads:
         thread.join()
     assert errors == []
+
+
+def test_a_folder_that_comes_and_goes_while_it_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another writer makes the folder after the first look, and whoever deletes takes it away before the second."""
+    blobs = FolderBlobs(tmp_path / "root")
+    mkdir, raced = os.mkdir, []
+
+    def race(path: str | Path, mode: int = 0o777) -> None:
+        if Path(path).name == "b" and not raced:
+            raced.append(path)
+            raise FileExistsError(path)
+        mkdir(path, mode)
+
+    monkeypatch.setattr(os, "mkdir", race)
+    assert blobs.put_if_absent("a/b/c", b"x")
+    assert raced
+    assert blobs.get("a/b/c") == b"x"
 
 
 FILL = """

@@ -101,3 +101,19 @@ def test_settings(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
     assert settings.database == "postgresql+psycopg://u@h/d"
     assert settings.blobs == "s3://bucket/prefix"
     assert settings.redis_password() == "secret"
+
+
+def test_connections_that_are_in_use_at_the_end_are_closed_too(database_url: str) -> None:
+    """A server that stops leaves threads behind that still ask, and may ask once more."""
+    database = Database(database_url)
+    used = []
+    for number in range(3):
+        with database.read() as session:
+            used.append(session.connection().connection.dbapi_connection)
+            if number == 0:
+                database.close()
+            assert session.execute(text("select 1")).scalar_one() == 1
+    for connection in used:
+        assert connection is not None
+        with pytest.raises(connect(database_url).dialect.loaded_dbapi.Error, match="closed"):
+            connection.cursor().execute("select 1")

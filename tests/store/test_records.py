@@ -224,6 +224,16 @@ def test_owners_do_not_see_each_other(bench: Any) -> None:
             act(job, "somebody else")
 
 
+def test_a_log_may_hold_any_character(bench: Any) -> None:
+    job = bench.job()
+    bench.records.claim(job, 1, "w")
+    bench.records.heartbeat(job, 1, log_tail="x" * 9000 + "a\0b")
+    assert bench.records.job(job).log_tail[-4:] == "xa\ufffdb"
+    assert len(bench.records.job(job).log_tail) == 8000
+    bench.records.lost(job, 1, log_tail="\0")
+    assert bench.records.job(job).log_tail == "\ufffd"
+
+
 def test_events_are_changes_of_state_and_stage(bench: Any) -> None:
     job = bench.job()
     bench.records.claim(job, 1, "w")

@@ -2,46 +2,60 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from advtex_contract.jobs import JobSpec
 from advtex_store import keys
 from advtex_store.blobs import Blobs, FolderBlobs, open_blobs
-from advtex_store.errors import StoreError
+from advtex_store.errors import RecordNotFound, StoreError
 from advtex_store.ids import new_id
 from advtex_store.models import JobRow, UploadRow
+from advtex_store.partials import Partial, Unpublished
 from advtex_store.results import Results
 from advtex_store.retention import SETTLED_SECONDS, Retention
 from advtex_store.s3 import S3Blobs
+from advtex_store.s3_partial import MULTIPART_SUFFIX
+
+SCAN = b"the bytes of a scan"
+SIZE = len(SCAN)
 
 
 class World:
     """Everything that servers and workers do with rows and blobs, in their order, on a random object."""
 
-    def __init__(self, bench: Any, blobs: Blobs, folder: Path, data: st.DataObject) -> None:
+    def __init__(self, bench: Any, blobs: Interrupted, folder: Path, data: st.DataObject) -> None:
         self.bench, self.blobs, self.data = bench, blobs, data
         self.retention = Retention(bench.database, blobs)
         self.results = Results(bench.records, blobs)
         self.file = folder / "file"
         self.file.write_bytes(b"result")
         self.uploads: list[str] = []
+        self.partials: list[tuple[str, Partial]] = []  # of requests that are still open, or died
         self.jobs: list[str] = []
-        self.owed: dict[str, str] = {}  # blobs that a row refers to -> id of the row
+        for begin in (self.begin_upload, self.submit_scan, self.run_job):
+            begin()
 
     def actions(self) -> dict[str, Callable[[], object]]:
         return {
             "begin upload": self.begin_upload,
             "finish upload": self.finish_upload,
+            "open request": self.open_request,
+            "piece": self.send_piece,
+            "last piece": self.send_last_piece,
+            "death in mid-request": self.die_in_mid_request,
             "discard upload": self.discard_upload,
             "late upload": self.write_late,
             "create job": self.create_job,
+            "submit scan": self.submit_scan,
+            "run job": self.run_job,
             "checkpoint": self.checkpoint,
             "succeed": self.succeed,
             "cancel": lambda: self.bench.records.cancel(self.pick(self.jobs)),
@@ -65,12 +79,56 @@ class World:
         return ids[self.data.draw(st.integers(0, len(ids) - 1))] if ids else ids[0]
 
     def begin_upload(self) -> None:
-        self.uploads.append(self.bench.uploads.create("me", 4).id)
+        """A row and its first bytes, in a request that stays open."""
+        row = self.bench.uploads.create("me", SIZE)
+        self.uploads.append(row.id)
+        row = self.bench.uploads.seize(row.id, "me")
+        self.partials.append((row.holder, self.blobs.resume(keys.scan_key(row.id), SIZE, 0)))
+        self.go_on_with(*self.partials[-1])
+
+    def open_request(self) -> None:
+        """tus: seize the row, then go on with its bytes."""
+        row = self.bench.uploads.seize(self.pick(self.uploads), "me")
+        self.partials.append((row.holder, self.blobs.resume(keys.scan_key(row.id), SIZE, row.offset)))
+
+    def send_piece(self) -> None:
+        self.go_on_with(*self.pick(self.partials))
+
+    def go_on_with(self, holder: str, partial: Partial) -> None:
+        row = self.held_by(holder)
+        assert partial.offset >= row.offset, "bytes are durable that no writer wrote"
+        partial.write(SCAN[partial.offset : min(partial.offset + 4, SIZE - 1)])
+        partial.flush()
+        self.bench.uploads.advance(row.id, holder, partial.offset)
+        partial.settle()
+
+    def send_last_piece(self) -> None:
+        holder, partial = self.pick(self.partials)
+        row = self.held_by(holder)
+        partial.write(SCAN[partial.offset :])
+        partial.publish()
+        self.bench.uploads.finish(row.id, "ab" * 32)
+
+    def held_by(self, holder: str) -> UploadRow:
+        with self.bench.database.read() as session:
+            row: UploadRow | None = session.query(UploadRow).filter(UploadRow.holder == holder).one_or_none()
+        if row is None:
+            raise RecordNotFound("another request has it")
+        return row
+
+    def die_in_mid_request(self) -> None:
+        """Of S3: between the multipart upload and the blob that has its id; and in the middle of a result."""
+        if isinstance(self.blobs, S3Blobs):
+            upload, job = self.pick(self.uploads), self.pick(self.jobs)
+            self.bench.uploads.upload(upload)
+            self.blobs._multipart.create(keys.scan_key(upload))
+            self.bench.records.job(job)
+            self.blobs._multipart.create(keys.result_key(job, 1, "texture.png"))
 
     def finish_upload(self) -> None:
         upload = self.pick(self.uploads)
         self.bench.uploads.upload(upload)
-        self.blobs.put(keys.scan_key(upload), b"scan")
+        self.blobs.put(keys.scan_key(upload), SCAN)
         self.bench.uploads.finish(upload, "ab" * 32)
 
     def discard_upload(self) -> None:
@@ -81,7 +139,21 @@ class World:
 
     def write_late(self) -> None:
         """A writer that does not know yet that its row is gone."""
-        self.blobs.put(keys.scan_key(self.pick(self.uploads)), b"scan")
+        self.blobs.put(keys.scan_key(self.pick(self.uploads)), SCAN)
+
+    def submit_scan(self) -> None:
+        """All of an upload, and a job of it."""
+        row = self.bench.uploads.create("me", SIZE)
+        self.uploads.append(row.id)
+        self.blobs.put(keys.scan_key(row.id), SCAN)
+        self.bench.uploads.finish(row.id, "ab" * 32)
+        self.jobs.append(self.bench.submissions.create_job("me", JobSpec(upload_id=row.id)).id)
+
+    def run_job(self) -> None:
+        """The newest job is claimed and has a checkpoint."""
+        job = self.jobs[-1]
+        row = self.bench.records.claim(job, self.bench.records.job(job).attempt, "w")
+        self.blobs.put(keys.checkpoint_prefix(job, row.attempt) + "1/0", b"state")
 
     def create_job(self) -> None:
         spec = JobSpec(upload_id=self.pick(self.uploads))
@@ -105,11 +177,21 @@ class World:
         self.bench.clock.now += self.data.draw(st.sampled_from([1.0, SETTLED_SECONDS, 90_000.0]))
 
     def check(self) -> None:
-        """Whatever a row refers to is there."""
+        """Whatever a row refers to is there; nothing goes on while this looks."""
+        self.blobs.calm = True
+        try:
+            self.check_rows()
+        finally:
+            self.blobs.calm = False
+
+    def check_rows(self) -> None:
         with self.bench.database.read() as session:
             uploads = session.query(UploadRow).filter(UploadRow.deleted_at.is_(None), UploadRow.sha256.is_not(None))
             for upload in uploads:
-                assert self.blobs.exists(keys.scan_key(upload.id)), "a scan was removed"
+                assert self.blobs.is_published(keys.scan_key(upload.id), SIZE), "a scan was removed"
+            begun = session.query(UploadRow).filter(UploadRow.deleted_at.is_(None), UploadRow.sha256.is_(None))
+            for upload in begun.filter(UploadRow.offset > 0):
+                self.check_pieces(keys.scan_key(upload.id), upload.offset)
             for job in session.query(JobRow).filter(JobRow.deleted_at.is_(None)):
                 for entry in job.results:
                     assert self.blobs.exists(entry["key"]), "a result was removed"
@@ -118,50 +200,103 @@ class World:
                 elif job.state == "running":
                     assert self.blobs.exists(keys.checkpoint_prefix(job.id, job.attempt) + "1/0")
 
+    def check_pieces(self, key: str, offset: int) -> None:
+        """What the row calls durable can be gone on with."""
+        self.blobs.resume(key, SIZE, offset).close()  # else BlobNotFound
+        if isinstance(self.blobs, S3Blobs) and not self.blobs.is_published(key, SIZE):
+            held = [found.upload_id for found in self.blobs.unpublished(keys.SCANS) if found.key == key]
+            assert self.blobs.get(key + MULTIPART_SUFFIX).decode() in held, "parts were removed"
 
-class Interrupted(FolderBlobs):
+    def end(self) -> None:
+        """Without rows, nothing is kept for long."""
+        for _, partial in self.partials:
+            partial.close()
+        with self.bench.database.write() as session:
+            session.query(JobRow).delete()
+            session.query(UploadRow).delete()
+        self.retention.sweep()
+        for prefix in (keys.SCANS, keys.JOBS):
+            assert [*self.blobs.list(prefix), *self.blobs.unpublished(prefix)] == []
+
+
+class Interrupted(Blobs):
     """Lets the world go on between the look at the blobs, the look at the rows, and every removal."""
 
     world: World
+    calm = False
 
     def folders(self, prefix: str) -> Iterator[str]:
         found = list(super().folders(prefix))
-        for _ in range(self.world.data.draw(st.integers(0, 4))):
-            self.world.step()
+        self.go_on(4)
+        return iter(found)
+
+    def unpublished(self, prefix: str) -> Iterator[Unpublished]:
+        found = list(super().unpublished(prefix))
+        self.go_on(2)
         return iter(found)
 
     def delete_prefix(self, prefix: str) -> None:
-        self.world.step()
+        self.go_on(1)
         super().delete_prefix(prefix)
 
+    def go_on(self, steps: int) -> None:
+        for _ in range(0 if self.calm else self.world.data.draw(st.integers(0, steps))):
+            self.world.step()
 
-@settings(
-    max_examples=60,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large],
-)
-@given(data=st.data())
-def test_sweeping_never_removes_what_a_row_refers_to(sqlite_bench: Any, data: st.DataObject) -> None:
+
+class InterruptedFolder(Interrupted, FolderBlobs): ...
+
+
+class InterruptedS3(Interrupted, S3Blobs): ...
+
+
+def live_on(bench: Any, blobs: Interrupted, data: st.DataObject) -> None:
+    """A while of everything, with sweeps."""
     with tempfile.TemporaryDirectory() as folder:
-        blobs = Interrupted(Path(folder) / "blobs")
-        world = World(sqlite_bench, blobs, Path(folder), data)
-        blobs.world = world
-        with sqlite_bench.database.write() as session:  # of the example before
+        world = blobs.world = World(bench, blobs, Path(folder), data)
+        with bench.database.write() as session:  # of an example that hypothesis gave up
             session.query(JobRow).delete()
             session.query(UploadRow).delete()
         for _ in range(data.draw(st.integers(1, 5))):
-            for _ in range(data.draw(st.integers(1, 12))):
+            for _ in range(data.draw(st.integers(0, 12))):
                 world.step()
                 world.check()
             world.retention.sweep()
             world.check()
+        blobs.calm = True
+        world.end()
+
+
+EXAMPLES = settings(
+    max_examples=60,
+    phases=[Phase.explicit, Phase.generate],
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large],
+)
+
+
+@EXAMPLES
+@given(data=st.data())
+def test_sweeping_never_removes_what_a_row_refers_to(sqlite_bench: Any, data: st.DataObject) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        live_on(sqlite_bench, InterruptedFolder(Path(folder)), data)
+
+
+@pytest.mark.slow
+@settings(EXAMPLES, max_examples=15)
+@given(data=st.data())
+def test_sweeping_a_bucket_spares_what_a_row_refers_to(
+    sqlite_bench: Any, data: st.DataObject, s3_url: str, small_parts: None, tmp_path: Path
+) -> None:
+    bucket = s3_url.split("/")[2]
+    live_on(sqlite_bench, InterruptedS3(bucket, os.urandom(6).hex(), tmp_path), data)
 
 
 def test_multipart_uploads_whose_writers_died_are_aborted(bench: Any, s3_url: str, tmp_path: Path) -> None:
     blobs = open_blobs(s3_url, tmp_path)
     assert isinstance(blobs, S3Blobs)
     retention = Retention(bench.database, blobs)
-    begun, complete, job = bench.uploads.create("me", 5000).id, bench.finished_upload(), bench.job()
+    begun, complete, job = bench.uploads.create("me", SIZE).id, bench.finished_upload(), bench.job()
     create = blobs._multipart.create
     kept = [create(keys.scan_key(begun)), create(keys.result_key(job, 1, "a")), create("scans/by hand/x")]
     for key in (keys.scan_key(new_id(bench.clock.now)), keys.scan_key(complete)):
@@ -173,7 +308,7 @@ def test_multipart_uploads_whose_writers_died_are_aborted(bench: Any, s3_url: st
 
     assert retention.sweep() == 2
     assert left() == sorted(kept), "a writer may have begun them this moment"
-    blobs.resume(keys.scan_key(begun), 5000, 0).close()  # the client tries again
+    blobs.resume(keys.scan_key(begun), SIZE, 0).close()  # the client tries again
     assert retention.sweep() == 1
     assert kept[0] not in left()
     assert len(left()) == 3
@@ -205,10 +340,10 @@ def test_what_comes_late_for_a_purged_job_goes_too(bench: Any, blobs: Blobs) -> 
     bench.records.cancel(job)
     bench.records.delete(job)
     retention.purge()
-    late = keys.checkpoint_prefix(job, 1) + "1/0"
-    blobs.put(late, b"x")
-    assert retention.sweep() == 1
-    assert not blobs.exists(late)
+    for late in (keys.checkpoint_prefix(job, 1) + "1/0", keys.live_key(job, 1)):
+        blobs.put(late, b"x")
+        assert retention.sweep() == 1
+        assert not blobs.exists(late)
 
 
 def test_leftovers_of_other_attempts_go_and_the_result_stays(bench: Any, blobs: Blobs, tmp_path: Path) -> None:
@@ -216,7 +351,7 @@ def test_leftovers_of_other_attempts_go_and_the_result_stays(bench: Any, blobs: 
     (tmp_path / "a").write_bytes(b"a")
     job = bench.job()
     bench.records.claim(job, 1, "w")
-    for key in (keys.result_key(job, 7, "a"), keys.checkpoint_prefix(job, 1) + "1/0"):
+    for key in (keys.result_key(job, 7, "a"), keys.checkpoint_prefix(job, 1) + "1/0", keys.live_key(job, 1)):
         blobs.put(key, b"late")
     results.commit(job, 1, {"a": tmp_path / "a"})
     assert retention.tidy() == 0, "another attempt may still be at it"

@@ -139,6 +139,10 @@ def test_keys(bench: Any) -> None:
         bench.accounts.revoke_key("none")
     with pytest.raises(ValueError, match="the scopes are"):
         bench.accounts.create_key(scopes=["fly"])
+    for names in ({"name": "x" * 256}, {"owner": "x" * 256}):
+        with pytest.raises(ValueError, match="255 characters at most"):
+            bench.accounts.create_key(**names)
+    assert bench.accounts.create_key("x" * 255, owner="y" * 255)
 
 
 def test_keys_expire_and_share_an_owner(bench: Any) -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from advtex_engine.config import TextureConfig
 from advtex_engine.errors import OptionError, Problem, ScanError, Stopped
-from advtex_engine.monitor import Monitor
+from advtex_engine.monitor import Glimpse, Monitor
 
 RESULTS = ("model.obj", "model.mtl", "model.png", "model.glb", "report.json", "previews/side_by_side.png")
 
@@ -28,13 +28,21 @@ def quick(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: b
     monitor.stage_started("ingest")
     assert scan.stat().st_size > 0
     monitor.warning(Problem("frame_dropped", "color/9.png", "has no pose", "give it one"))
-    monitor.stage_finished("ingest", 0.01, 1)
+    monitor.stage_finished("ingest", 0.01, 1 << 20, None)
     monitor.stage_started("optimization")
     for step in range(1, 4):
         monitor.progress(step, 3, {"l1": 1.0 / step, "adversarial": float("nan")})
-    monitor.stage_finished("optimization", 0.02, 1)
+    monitor.stage_finished("optimization", 0.02, 2 << 20, 3 << 20)
     print("a stray line on stdout")  # must not be taken for an event
     write_results(out, f"seed {config.seed} size {config.size}")
+
+
+def coarse(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
+    """The real engine; but what it fuses from depth has voxels of 8 cm, and not of 1 cm."""
+    from advtex_engine import fusion, pipeline
+
+    fusion.COARSEST = fusion.FINEST = 0.08
+    pipeline.texture_scan(scan, out, config, work=work, resume=resume, monitor=monitor)
 
 
 def scored(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
@@ -92,6 +100,26 @@ def chain(steps: int) -> str:
     for step in range(1, steps + 1):
         link = hashlib.sha256(f"{link} {step}".encode()).hexdigest()
     return link
+
+
+def glimpsing(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
+    """Shows itself every 10 ms until it is asked to stop; the picture's bytes tell the step. Of an attempt that
+    resumes nothing is seen."""
+    monitor.stage_started("optimization")
+    monitor.note("12 of 30 frames become views")
+    mark = work / "mark.txt"
+    mark.write_text("the first attempt was here")
+    monitor.checkpointed((mark,))
+    for step in range(1, 6000):
+        curves = {"steps": [step], "series": {"l1": [0.5]}, "quality": {"steps": [], "series": {}}}
+        if not resume:
+            titles = {"0.jpg": "color/<1>.png"}
+            monitor.glimpsed(Glimpse(step, {"0.jpg": b"picture %d" % step}, titles, curves))
+            monitor.glimpsed(Glimpse(step, {"0.jpg": bytes(10**6)}, titles, curves))  # too large to be passed on
+        monitor.progress(step, 6000, {"l1": 0.5})
+        if monitor.stop_requested():
+            raise Stopped
+        time.sleep(0.01)
 
 
 def crashes(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:

@@ -52,7 +52,7 @@ class Fleet:
         variables: Mapping[str, str],
     ) -> None:
         self.place = place
-        self.log = folder / "fleet.log"
+        self.log, self.redis_log = folder / "fleet.log", folder / "redis.log"
         self.journal = folder / "journal"
         self.journal.touch()
         self.redis_folder = place.data / "redis"
@@ -138,7 +138,7 @@ class Fleet:
         path = os.pathsep.join(str(Path(entry).absolute()) for entry in (*sys.path, SUPPORT) if entry)
         kept = {name: value for name, value in os.environ.items() if not name.startswith(("ADVTEX_", "AWS_"))}
         environment = {**kept, **RHYTHM, **variables, "PYTHONPATH": path, "JOURNAL": str(self.journal)}
-        with self.log.open("ab") as log:
+        with (self.redis_log if command[0] == redis_binary() else self.log).open("ab") as log:
             return subprocess.Popen(command, env=environment, stdout=log, stderr=log)
 
 
@@ -161,6 +161,7 @@ def fleet(
             yield running
         except BaseException:
             print(running.log.read_text(errors="replace")[-12_000:])
+            print(running.redis_log.read_text(errors="replace")[-3_000:])
             raise
         finally:
             running.stop()

@@ -4,6 +4,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,10 +21,10 @@ sys.path.insert(0, str(SUPPORT))
 
 
 @pytest.fixture
-def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> WorkerSettings:
+def settings(tmp_path: Path, place: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> WorkerSettings:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([*sys.path, str(SUPPORT)]))
     rhythm = {"lease_seconds": 3.0, "grace_seconds": 1.0, "heartbeat_seconds": 0.05}
-    return WorkerSettings(data_dir=tmp_path / "data", device="cpu", threads=1, **rhythm)
+    return WorkerSettings(data_dir=tmp_path / "data", device="cpu", threads=1, **rhythm, **place)
 
 
 @pytest.fixture

@@ -60,6 +60,7 @@ def test_a_finished_attempt_is_adopted_instead_of_repeated(store: Store, host: H
     assert store.blobs.get(keys.result_manifest_key(job_id)) == manifest
 
 
+@pytest.mark.one_machine("how engines end, wherever rows and blobs are")
 @pytest.mark.parametrize(
     ("engine", "code", "words"),
     [
@@ -82,6 +83,7 @@ def test_an_error_that_would_come_again_fails_the_job(
     assert ("Traceback" in row.error["log_tail"]) == (code != "invalid_options")
 
 
+@pytest.mark.one_machine("how engines end, wherever rows and blobs are")
 def test_a_full_disk_pauses_the_attempt_and_costs_nothing(store: Store, host: Hosts, new_job: NewJob) -> None:
     job_id = new_job()
     thread = in_background(host("finds_the_disk_full"), job_id)
@@ -110,6 +112,7 @@ def test_a_scan_that_is_gone_fails_the_job(store: Store, host: Hosts, new_job: N
     assert error["code"] == "scan_missing"
 
 
+@pytest.mark.one_machine("how engines end, wherever rows and blobs are")
 @pytest.mark.parametrize(
     ("engine", "sentence"),
     [
@@ -160,6 +163,7 @@ def test_sigterm_preempts_without_counting_as_a_death(store: Store, host: Hosts,
     assert state["began"] == sorted(state["began"])
 
 
+@pytest.mark.one_machine("forks this process, in which the client of S3 has threads")
 def test_a_sigterm_to_the_runner_alone_is_a_preemption_too(store: Store, host: Hosts, new_job: NewJob) -> None:
     job_id = new_job(steps=1000)
     parent = os.fork()
@@ -206,6 +210,7 @@ def test_a_flaw_of_the_worker_itself_is_a_death_with_its_traceback(
     assert "ZeroDivisionError: a flaw" in row.log_tail
 
 
+@pytest.mark.one_machine("how engines end, wherever rows and blobs are")
 @pytest.mark.parametrize("engine", ["hangs", "ignores_stop"])
 def test_a_runner_that_does_not_stop_is_killed_after_the_grace(
     store: Store, host: Hosts, new_job: NewJob, engine: str
@@ -237,6 +242,7 @@ def test_a_lost_lease_ends_the_runner_and_commits_nothing(store: Store, host: Ho
     assert {blob.key: blob.etag for blob in store.blobs.list(keys.checkpoints_prefix(job_id))} == before
 
 
+@pytest.mark.one_machine("about folders of the worker")
 def test_leftovers_of_killed_attempts_are_swept_and_live_ones_kept(
     store: Store, host: Hosts, new_job: NewJob, settings: WorkerSettings
 ) -> None:
@@ -253,6 +259,7 @@ def test_leftovers_of_killed_attempts_are_swept_and_live_ones_kept(
     assert store.records.job(running).state == JobState.succeeded
 
 
+@pytest.mark.one_machine("forks this process, in which the client of S3 has threads")
 def test_the_runner_dies_with_its_parent(store: Store, settings: WorkerSettings, new_job: NewJob) -> None:
     job_id = new_job()
     parent = os.fork()

@@ -1,40 +1,42 @@
-"""Checkpoints in the blob storage: only whole ones are ever used."""
+"""Checkpoints in both blob storages: only whole ones are ever used."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 from advtex_store import keys
-from advtex_store.blobs import Blobs, FolderBlobs, Written
+from advtex_store.blobs import Blobs, Written
 from advtex_store.errors import NoSpace
 from advtex_worker.checkpoints import EMPTY, CheckpointIndex, CheckpointUploader, restore
 
 JOB = "0" * 28
 
 
-class FlakyBlobs(FolderBlobs):
-    """A storage whose uploads fail while `full`; `on_upload` is called before each."""
+@dataclass
+class Uploads:
+    """What becomes of them: they fail while `full`; `begins` is called before each."""
 
-    full = False
-
-    def __init__(self, root: Path) -> None:
-        super().__init__(root)
-        self.on_upload: Callable[[str], None] = lambda _key: None
-
-    def upload(self, path: Path, key: str) -> Written:
-        self.on_upload(key)
-        if self.full:
-            raise NoSpace("the disk is full")
-        return super().upload(path, key)
+    full: bool = False
+    begins: Callable[[str], None] = lambda _key: None
 
 
 @pytest.fixture
-def blobs(tmp_path: Path) -> FlakyBlobs:
-    return FlakyBlobs(tmp_path / "blobs")
+def uploads(blobs: Blobs, monkeypatch: pytest.MonkeyPatch) -> Uploads:
+    fate, upload = Uploads(), blobs.upload
+
+    def flaky(path: Path, key: str) -> Written:
+        fate.begins(key)
+        if fate.full:
+            raise NoSpace("the disk is full")
+        return upload(path, key)
+
+    monkeypatch.setattr(blobs, "upload", flaky)
+    return fate
 
 
 def snapshot(tmp_path: Path, text: str) -> Path:
@@ -54,7 +56,7 @@ def restored(blobs: Blobs, before: int, work: Path) -> dict[str, str]:
     return {name: (work / name).read_text() for name in index.files}
 
 
-def test_the_newest_version_of_every_file_comes_back(blobs: FlakyBlobs, tmp_path: Path) -> None:
+def test_the_newest_version_of_every_file_comes_back(blobs: Blobs, tmp_path: Path) -> None:
     up = uploader(blobs, 1)
     up.add({"atlas.npz": snapshot(tmp_path, "atlas"), "deep/er/state.pt": snapshot(tmp_path, "step 1")})
     up.add({"deep/er/state.pt": snapshot(tmp_path, "step 2")})
@@ -63,7 +65,7 @@ def test_the_newest_version_of_every_file_comes_back(blobs: FlakyBlobs, tmp_path
     assert list((tmp_path / "snapshots").iterdir()) == [], "snapshots were left behind"
 
 
-def test_what_is_no_longer_part_of_the_checkpoint_is_removed(blobs: FlakyBlobs, tmp_path: Path) -> None:
+def test_what_is_no_longer_part_of_the_checkpoint_is_removed(blobs: Blobs, tmp_path: Path) -> None:
     base = EMPTY
     for attempt, text in ((1, "one"), (1, "two"), (1, "three")):
         up = uploader(blobs, attempt, base)
@@ -73,7 +75,7 @@ def test_what_is_no_longer_part_of_the_checkpoint_is_removed(blobs: FlakyBlobs, 
     assert len(list(blobs.list(keys.checkpoints_prefix(JOB)))) == 2  # the file and the index
 
 
-def test_a_later_attempt_carries_unchanged_files_over(blobs: FlakyBlobs, tmp_path: Path) -> None:
+def test_a_later_attempt_carries_unchanged_files_over(blobs: Blobs, tmp_path: Path) -> None:
     up = uploader(blobs, 1)
     up.add({"atlas": snapshot(tmp_path, "atlas"), "state": snapshot(tmp_path, "old")})
     up.finish()
@@ -85,7 +87,7 @@ def test_a_later_attempt_carries_unchanged_files_over(blobs: FlakyBlobs, tmp_pat
     assert restored(blobs, 2, tmp_path / "work") == {"atlas": "atlas", "state": "old"}
 
 
-def test_a_checkpoint_without_its_index_is_not_there(blobs: FlakyBlobs, tmp_path: Path) -> None:
+def test_a_checkpoint_without_its_index_is_not_there(blobs: Blobs, tmp_path: Path) -> None:
     up = uploader(blobs, 1)
     up.add({"state": snapshot(tmp_path, "whole")})
     up.finish()
@@ -94,7 +96,7 @@ def test_a_checkpoint_without_its_index_is_not_there(blobs: FlakyBlobs, tmp_path
 
 
 @pytest.mark.parametrize("harm", ["missing", "damaged"])
-def test_a_broken_checkpoint_is_passed_over_for_an_older_one(blobs: FlakyBlobs, tmp_path: Path, harm: str) -> None:
+def test_a_broken_checkpoint_is_passed_over_for_an_older_one(blobs: Blobs, tmp_path: Path, harm: str) -> None:
     for attempt, text in ((1, "old"), (2, "new")):
         up = uploader(blobs, attempt)
         up.add({"state": snapshot(tmp_path, text), f"only in {attempt}": snapshot(tmp_path, "x")})
@@ -108,7 +110,7 @@ def test_a_broken_checkpoint_is_passed_over_for_an_older_one(blobs: FlakyBlobs, 
     assert sorted(path.name for path in (tmp_path / "work").iterdir()) == ["only in 1", "state"]
 
 
-def test_a_stale_attempt_leaves_the_index_alone(blobs: FlakyBlobs, tmp_path: Path) -> None:
+def test_a_stale_attempt_leaves_the_index_alone(blobs: Blobs, tmp_path: Path) -> None:
     up = uploader(blobs, 1)
     up.add({"state": snapshot(tmp_path, "mine")})
     up.finish()
@@ -118,14 +120,14 @@ def test_a_stale_attempt_leaves_the_index_alone(blobs: FlakyBlobs, tmp_path: Pat
     assert restored(blobs, 2, tmp_path / "work") == {"state": "mine"}
 
 
-def test_abandoning_in_the_middle_of_an_upload_commits_nothing(blobs: FlakyBlobs, tmp_path: Path) -> None:
+def test_abandoning_in_the_middle_of_an_upload_commits_nothing(blobs: Blobs, uploads: Uploads, tmp_path: Path) -> None:
     uploading, go_on = threading.Event(), threading.Event()
 
     def pause(key: str) -> None:
         uploading.set()
         go_on.wait(5.0)
 
-    blobs.on_upload = pause
+    uploads.begins = pause
     up = uploader(blobs, 1)
     up.add({"state": snapshot(tmp_path, "x")})
     assert uploading.wait(5.0)
@@ -139,15 +141,15 @@ def test_abandoning_in_the_middle_of_an_upload_commits_nothing(blobs: FlakyBlobs
 
 
 def test_a_full_disk_delays_the_checkpoint_and_loses_nothing(
-    blobs: FlakyBlobs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    blobs: Blobs, uploads: Uploads, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("advtex_worker.checkpoints.RETRY_SECONDS", 0.01)
     tried = threading.Event()
-    blobs.on_upload = lambda _key: tried.set()
-    blobs.full = True
+    uploads.begins = lambda _key: tried.set()
+    uploads.full = True
     up = uploader(blobs, 1)
     up.add({"state": snapshot(tmp_path, "kept")})
     assert tried.wait(5.0)
-    blobs.full = False
+    uploads.full = False
     up.finish()
     assert restored(blobs, 2, tmp_path / "work") == {"state": "kept"}

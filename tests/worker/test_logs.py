@@ -53,12 +53,14 @@ def told(log: Path) -> list[dict[str, Any]]:
     return lines
 
 
+@pytest.mark.one_machine("about the lines of a log")
 def test_the_command_logs_json(start: Start, log: Path) -> None:
     start("-m", "advtex_worker.main")
     wait_until(lambda: log.read_text().count("\n") >= 2, seconds=60)
     assert [line["event"] for line in told(log)] == ["worker begins", "worker takes jobs"]
 
 
+@pytest.mark.one_machine("about the lines of a log")
 def test_every_line_about_a_job_names_it(
     store: Store, start: Start, log: Path, redis_url: str, settings: WorkerSettings, new_job: Callable[..., str]
 ) -> None:

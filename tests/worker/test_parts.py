@@ -39,6 +39,7 @@ from advtex_worker.events import (
     parse_event,
 )
 from advtex_worker.lease import Ending, LeaseKeeper
+from advtex_worker.locks import try_lock
 from advtex_worker.memory import usable_memory
 from advtex_worker.progress import ProgressTracker
 
@@ -66,7 +67,15 @@ def test_methods_of_users_and_engine_are_the_same() -> None:
     assert {method.value for method in Method} == set(engine.METHODS)
 
 
-BOUNDS = {"width": 64, "height": 64, "steps": 1, "face_budget": 100, "max_texture_size": 256, "holdout": 2}
+BOUNDS = {
+    "width": 64,
+    "height": 64,
+    "steps": 1,
+    "face_budget": 100,
+    "max_texture_size": 256,
+    "holdout": 2,
+    "max_views": 2,
+}
 
 
 @pytest.mark.parametrize("name", sorted(BOUNDS))
@@ -85,9 +94,17 @@ def test_the_engine_takes_what_the_contract_takes_at_its_bounds(name: str) -> No
     st.integers(2, 1000),
     st.integers(0, 2**31 - 1),
     st.none() | st.integers(100, 2_000_000),
+    st.none() | st.integers(2, 2000),
 )
 def test_every_option_arrives(
-    preset: Preset, method: Method, width: int, height: int, holdout: int, seed: int, face_budget: int | None
+    preset: Preset,
+    method: Method,
+    width: int,
+    height: int,
+    holdout: int,
+    seed: int,
+    face_budget: int | None,
+    max_views: int | None,
 ) -> None:
     options = JobOptions(
         preset=preset,
@@ -97,13 +114,17 @@ def test_every_option_arrives(
         holdout=holdout,
         seed=seed,
         face_budget=face_budget,
+        max_views=max_views,
         steps=9,
+        layout="tum",
     )
     config = texture_config(options, "cuda:1")
     assert (config.preset, config.method) == (preset.value, method.value)
     assert (config.size, config.holdout, config.seed) == ((width, height), holdout, seed)
     assert (config.steps, config.device, config.max_texture_size) == (9, "cuda:1", options.max_texture_size)
+    assert config.layout == "tum"
     assert config.face_budget == (engine.TextureConfig().face_budget if face_budget is None else face_budget)
+    assert config.max_views == (engine.TextureConfig().max_views if max_views is None else max_views)
 
 
 @pytest.mark.parametrize(
@@ -147,7 +168,7 @@ class Clock:
 
 def test_the_eta_counts_only_steps_of_this_attempt() -> None:
     clock = Clock()
-    tracker = ProgressTracker({}, clock)
+    tracker = ProgressTracker(Progress(), clock)
     tracker.stage(StageEvent(stage="optimization"))
     tracker.progress(ProgressEvent(step=3000, steps=4000))  # resumed
     assert tracker.view.eta_seconds is None
@@ -160,7 +181,7 @@ def test_the_eta_counts_only_steps_of_this_attempt() -> None:
 
 @given(st.lists(st.tuples(st.sampled_from(STAGES), st.integers(0, 1_000_000)), max_size=20))
 def test_reached_grows_with_stage_and_step_and_never_shrinks(moves: list[tuple[str, int]]) -> None:
-    tracker = ProgressTracker({})
+    tracker = ProgressTracker(Progress())
     best = (0, 0)
     for stage, step in moves:
         before = tracker.reached
@@ -173,7 +194,7 @@ def test_reached_grows_with_stage_and_step_and_never_shrinks(moves: list[tuple[s
 
 def test_the_seconds_of_stages_are_those_of_all_attempts() -> None:
     clock = Clock()
-    tracker = ProgressTracker({"ingest": 4.0, "optimization": 100.0}, clock)
+    tracker = ProgressTracker(Progress(stage_seconds={"ingest": 4.0, "optimization": 100.0}), clock)
     assert tracker.view.stage_seconds == {"ingest": 4.0, "optimization": 100.0}, "nothing is lost before the first word"
     tracker.stage(StageEvent(stage="atlas"))
     tracker.stage(StageEvent(stage="atlas", seconds=2.0))
@@ -247,7 +268,7 @@ def test_a_heartbeat_that_hangs_does_not_hide_the_end_of_the_lease() -> None:
 
 def test_memory_is_the_smallest_gpus_or_the_machines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tool = tmp_path / "nvidia-smi"
-    tool.write_text("#!/bin/sh\necho 24564\necho 8192\n")
+    tool.write_text("#!/bin/sh\necho GPU-a, 24564\necho GPU-b, 8192\n")
     tool.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
     assert usable_memory("auto") == usable_memory("cuda:1") == 8192 << 20
@@ -281,13 +302,12 @@ def test_progress_and_a_changed_log_travel_with_the_heartbeat() -> None:
 
 
 def test_a_device_lock_is_exclusive_and_free_again(tmp_path: Path) -> None:
-    devices = importlib.import_module("advtex_worker.devices")
     path = tmp_path / "gpu.lock"
-    held = devices.try_lock(path)
+    held = try_lock(path)
     assert held is not None
-    assert devices.try_lock(path) is None
+    assert try_lock(path) is None
     held.close()
-    again = devices.try_lock(path)
+    again = try_lock(path)
     assert again is not None
     again.close()
 
@@ -333,6 +353,24 @@ def test_auto_takes_the_gpu_that_is_free_and_waits_when_none_is(monkeypatch: pyt
     for lock in (second[1], again[1]):
         lock.close()
         Path(lock.name).unlink()
+
+
+def test_a_gpu_takes_as_many_jobs_as_it_may_and_the_emptiest_comes_first(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    devices = importlib.import_module("advtex_worker.devices")
+    monkeypatch.setattr(devices.torch, "cuda", TwoGpus())
+    monkeypatch.setattr(devices, "POLL_SECONDS", 0.01)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    taken = [devices.acquire("auto", lambda: False, 2) for _ in range(4)]
+    assert [name for name, _ in taken] == ["cuda:0", "cuda:1", "cuda:0", "cuda:1"]
+    asked = iter([False, False, True])
+    assert devices.acquire("auto", lambda: next(asked), 2) is None, "never more than two on either"
+    taken[3][1].close()
+    again = devices.acquire("auto", lambda: False, 2)
+    assert again[0] == "cuda:1"
+    for _, lock in (*taken, again):
+        lock.close()
 
 
 def test_the_runner_gets_the_weights_and_no_passwords() -> None:

@@ -1,0 +1,97 @@
+"""The fast step ends where the plain one does: by flags or by branches, in bfloat16 or in float32."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from advtex_engine.config import PRESETS, Preset
+from advtex_engine.discriminator import PatchDiscriminator
+from advtex_engine.examples import InputForm
+from advtex_engine.metrics import gradient_ratio, psnr, ssim
+from advtex_engine.operations import plain_operations
+from advtex_engine.optimize import AdversarialOptimizer
+from advtex_engine.planar import planar_maps, planar_pairs, shifted_views
+
+SIZE, SHIFT = 64, 2
+CPU = torch.device("cpu")
+
+
+def picture() -> torch.Tensor:
+    """[SIZE + 2 SHIFT, same, 3] uint8: noise with detail of two pixels."""
+    side = SIZE + 2 * SHIFT
+    noise = torch.rand((1, 3, side // 2, side // 2), generator=torch.Generator().manual_seed(0))
+    sharp = F.interpolate(noise, (side, side), mode="bilinear", align_corners=False)
+    return (sharp[0].permute(1, 2, 0) * 255).to(torch.uint8)
+
+
+def optimizer(preset: Preset, steps: int) -> AdversarialOptimizer:
+    maps = planar_maps(shifted_views(picture(), SIZE, SHIFT, 5, 0), SIZE, SIZE)
+    # The mean of all views: blurred.
+    start = maps.color.float().mean(0)[maps.slot_map.flatten() >= 0] / 255
+    of = AdversarialOptimizer(
+        maps,
+        planar_pairs(maps.count, CPU),
+        start,
+        preset,
+        kind="scene",
+        steps=steps,
+        generator=torch.Generator().manual_seed(0),
+        discriminator=PatchDiscriminator(torch.Generator().manual_seed(0)),
+        operations=plain_operations(),
+    )
+    of.bfloat16 = False
+    return of
+
+
+@pytest.mark.slow
+def test_two_hundred_steps_by_flags_end_like_those_by_branches() -> None:
+    """On a CPU what is skipped is not computed; on a GPU it is, and then not applied."""
+    preset = dataclasses.replace(
+        PRESETS["paper"], pretraining=20, averaging=50, lr_end=0.1, lr_discriminator=3e-4, max_crop=(32, 32)
+    )
+    branches, flags = optimizer(preset, 200), optimizer(preset, 200)
+    flags.branches = False
+    flags.form = dataclasses.replace(flags.form, channels=8)
+    for _ in range(200):
+        branches.step()
+        flags.step()
+    losses = branches.drain_losses()
+    assert 0.05 < losses["skipped"] < 0.95, "both ways were taken"
+    assert losses == pytest.approx(flags.drain_losses(), rel=1e-3)
+    torch.testing.assert_close(branches.values, flags.values, atol=2e-3, rtol=0)
+    torch.testing.assert_close(branches.result, flags.result, atol=2e-3, rtol=0)
+
+
+@pytest.mark.slow
+def test_bfloat16_gives_the_same_quality() -> None:
+    # Bold learning rates: where the processor lacks bfloat16, a step takes a second for each of the paper's crops.
+    preset = dataclasses.replace(
+        PRESETS["standard"],
+        pretraining=5,
+        lr_texture=1e-2,
+        lr_discriminator=1e-3,
+        l1_weight=0.1,
+        averaging=100,
+        alignment=False,
+        max_crop=(32, 32),
+    )
+    scores = []
+    for half in (False, True):
+        of = optimizer(preset, 45)
+        if half:
+            of.bfloat16 = True
+            of.form = InputForm(8, torch.bfloat16)
+        blurred = of.values.detach().clone()
+        for _ in range(45):
+            of.step()
+        truth = picture()[SHIFT:-SHIFT, SHIFT:-SHIFT].float() / 255
+        mask = torch.ones(truth.shape[:2], dtype=torch.bool)
+        start, end = (values.view(SIZE, SIZE, 3).clamp(0, 1) for values in (blurred, of.result))
+        assert float((end - start).abs().mean()) > 0.005, "the texture has gone somewhere"
+        scores.append([metric(end, truth, mask) for metric in (psnr, ssim, gradient_ratio)])
+    plain, fast = scores
+    assert fast == pytest.approx(plain, rel=0.02)

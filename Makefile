@@ -27,7 +27,7 @@ test: install
 	$(RUFF) format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/pytest
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal  # one thread each: threads of two processes wait for each other
 
 demo: install
 	@.ci/demo $(if $(SCAN),'$(SCAN)')

@@ -10,12 +10,17 @@ WORKDIR /src
 # The large wheels first: a change of the code does not fetch them again.
 COPY constraints.txt .
 RUN --mount=type=cache,target=/root/.cache/pip \
-    /opt/advtex/bin/pip install --constraint constraints.txt torch numpy opencv-python-headless
+    /opt/advtex/bin/pip install --constraint constraints.txt torch numpy opencv-python-headless av imagecodecs
 COPY . .
 RUN --mount=type=cache,target=/root/.cache/pip \
     /opt/advtex/bin/pip install --constraint constraints.txt '.[worker]'
 
 FROM python:3.12.11-slim-bookworm
+# Triton compiles what launches its kernels; versions are the base image's.
+# hadolint ignore=DL3008
+RUN apt-get update \
+    && apt-get install -y --no-install-recommends gcc libc6-dev \
+    && rm -rf /var/lib/apt/lists/*
 RUN useradd --system --uid 10001 --home-dir /var/lib/advtex --create-home advtex
 COPY --from=build /opt/advtex /opt/advtex
 ENV PATH=/opt/advtex/bin:$PATH \

@@ -115,6 +115,7 @@ def responses(network: PatchDiscriminator, condition: torch.Tensor, residual: to
 def test_one_step_is_adam_on_the_printed_losses(feature_weight: float) -> None:
     """Against torch's plain (not fused) Adam and plain autograd over a dense image, without the compact sampling."""
     of = optimizer(preset=dataclasses.replace(PRESET, feature_weight=feature_weight))
+    of.bfloat16 = False  # the twin computes in float32
     twin_network = PatchDiscriminator(torch.Generator().manual_seed(0))
     values = of.values.detach().clone().requires_grad_(True)
     adam_texture = torch.optim.Adam([values], lr=1e-3, betas=(0.5, 0.999), foreach=False)

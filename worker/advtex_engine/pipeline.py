@@ -142,7 +142,7 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
     parts = {
         "scan": describe_scene(scene),
         **made,
-        "refinement": refinement,
+        "refinement": refinement and refinement | given.facts.get("refinement", {}),
         "atlas": {key: getattr(atlas, key) for key in ("width", "height", "source", "charts", "pages")},
         "touched_texels": maps[1].slots,
         "stages": stages.records,

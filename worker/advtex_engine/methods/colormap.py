@@ -1,13 +1,24 @@
-"""Refined cameras, then the mean (Zhou and Koltun 2014, "Color Map Optimization for 3D Reconstruction")."""
+"""Refined cameras, smoothly corrected photographs, then the mean (Zhou and Koltun 2014, "Color Map Optimization")."""
 
 from __future__ import annotations
 
 from torch import Tensor
 
 from advtex_engine.methods.inputs import LossPoint, MethodInput
+from advtex_engine.methods.mean import mean_texture
+from advtex_engine.refine_warp import warp_views
+from advtex_engine.streaming import host_allocator
+from advtex_engine.views import build_view_maps
 
 
 def colormap(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
-    """The mean texture over cameras that the pipeline has refined (`TextureConfig.refines`), [H,W,3] in [0,1]."""
+    """The mean of the views as `warp_views` corrects them, [H,W,3] in [0,1]; no losses.
+
+    The cameras are those that the pipeline has refined (`TextureConfig.refines`).
+    """
     assert given.config.refines
-    return given.means[1], []
+    scene, device = given.scene, given.maps[1].device
+    views, warp = warp_views(scene.mesh, scene.views, scene.kind, device, given.config.seed)
+    given.facts["refinement"] = {"warp": warp}
+    allocate = None if given.on_device is None else host_allocator(device, given.work.path)
+    return mean_texture(build_view_maps(given.atlas, views, scene.kind, allocate)), []

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from advtex_engine.assignment import assign_views
+from advtex_engine.back_projection import back_project
 from advtex_engine.candidates import OCCLUSION_SHARE, find_candidates
 from advtex_engine.leveling import Sampler, blend_texels
 from advtex_engine.methods.inputs import LossPoint, MethodInput
@@ -36,7 +37,7 @@ def view_selection(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
 
 
 def select_views(given: MethodInput) -> Selection:
-    """One view per face, sampled texel by texel from the views at working size, leveled. Not differentiable."""
+    """One view per face, from the views at working size, leveled, with all their detail. Not differentiable."""
     atlas, maps = given.atlas, given.maps[1]
     mesh = atlas.mesh
     # What is hidden by less than this counts as seen.
@@ -45,12 +46,14 @@ def select_views(given: MethodInput) -> Selection:
     assignment = assign_views(mesh.t_pos_idx, candidates)
     texels = map_texels(atlas)
     blend = blend_texels(mesh, texels, assignment.view, candidates.view, Sampler(maps, tolerance))
-    color, known, confidence = (
-        torch.zeros((atlas.height * atlas.width, *part.shape[1:]), dtype=part.dtype, device=part.device)
-        for part in (blend.color, blend.known, blend.own)
+    own = torch.where(blend.known, assignment.view[texels.face], -1)
+    agreement = torch.where(blend.known, blend.own * assignment.agreement[texels.face], 0.0)
+    color, label, confidence = (
+        torch.full((atlas.height * atlas.width, *part.shape[1:]), nothing, dtype=part.dtype, device=part.device)
+        .index_copy_(0, texels.texel, part)
+        .view(atlas.height, atlas.width, *part.shape[1:])
+        for part, nothing in ((blend.color, 0), (own, -1), (agreement, 0))
     )
-    color[texels.texel], known[texels.texel] = blend.color, blend.known
-    confidence[texels.texel] = torch.where(blend.known, blend.own * assignment.agreement[texels.face], 0.0)
-    shape = (atlas.height, atlas.width)
-    texture = fill_holes(color.view(*shape, 3), known.view(shape))
-    return Selection(texture, known.view(shape), confidence.view(shape), assignment.view)
+    known = label >= 0
+    texture = fill_holes(back_project(color, label, maps), known)
+    return Selection(texture, known, confidence, assignment.view)

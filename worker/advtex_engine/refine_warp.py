@@ -19,10 +19,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advtex_engine.refine_check import better, disagreement, improved
+from advtex_engine.refine_check import MARGIN, better, disagreement, improved
 from advtex_engine.refine_points import Observations
 from advtex_engine.refine_pose import ROBUST_SCALE, local_contrast, look
-from advtex_engine.refine_sight import CONTRAST_SCALE, Sight, look_at
+from advtex_engine.refine_sight import CHECKED_SHARE, CONTRAST_SCALE, Sight, look_at
 from advtex_engine.refine_solve import residuals
 from advtex_engine.scene import Mesh, View
 from advtex_engine.texture import bilinear_footprint
@@ -33,6 +33,8 @@ LEVELS = ((4, 4), (2, 4), (1, 4))  # shrink factor of the image, Gauss-Newton st
 # offsets, which also fills in where there are no points.
 SMALL, SMOOTH = 0.02, 0.1
 LARGEST_STEP = 1.0  # pixels of the level
+CELL_SIZE = 0.02  # of the median depth, about 6 of 320 pixels: what of the surface is set aside to be checked
+CERTAIN = 2.0  # standard errors of a view's improvement: an unrelated photograph seems to help a little, too
 VIEWS_AT_ONCE = 32  # whose normal equations are in memory
 
 
@@ -47,10 +49,10 @@ def warp_views(
     sight = look_at(mesh, views, kind, device, seed)
     if sight is None:
         return views, {"unwarped": [view.name for view in views]}
-    seen = look(sight.features, sight.K, sight.given, sight.fitted, sight.size)
-    points = replace(sight.fitted, seen=seen.valid)
-    offsets = fit_offsets(sight.luminance, seen.pixel, points)
-    good, report = _approved(sight, offsets)
+    points, aside, cell = _points(sight, seed)
+    seen = look(sight.features, sight.K, sight.given, points, sight.size)
+    offsets = fit_offsets(sight.luminance, seen.pixel, replace(points, seen=seen.valid & ~aside))
+    good, report = _approved(sight, offsets, replace(points, seen=aside), cell)
     scale = offsets.new_tensor((views[0].camera.width / sight.size[0], views[0].camera.height / sight.size[1]))
     offsets = offsets * good[:, None, None, None] * scale
     moved = _interpolated(offsets, *_footprints(seen.pixel, sight.size, offsets.shape[1])).norm(dim=-1)
@@ -179,25 +181,41 @@ def _sample(features: Tensor, pixel: Tensor, size: tuple[int, int]) -> tuple[Ten
     return found[:, 0, :, 0], found[:, 1:, :, 0].mT, inside
 
 
-def _approved(sight: Sight, offsets: Tensor) -> tuple[Tensor, dict[str, Any]]:
+def _points(sight: Sight, seed: int) -> tuple[Observations, Tensor, Tensor]:
+    """All points that refinement has, which observations [V,K] are not to be fitted but to be checked, and cells [P].
+
+    Offsets are there for what lies between the points that they were fitted to, so the cells are smaller than a square
+    of nodes; those of `surface_cells` would say how offsets do far from all points.
+    """
+    one, other = sight.fitted, sight.checked
+    position = torch.cat((one.position, other.position))
+    point = torch.cat((one.point, other.point + len(one.position)), 1)
+    points = Observations(position, point, torch.cat((one.seen, other.seen), 1))
+    depth = look(sight.features, sight.K, sight.given, points, sight.size).local[..., 2][points.seen].median()
+    cell = torch.unique((position / (CELL_SIZE * depth)).floor().long(), dim=0, return_inverse=True)[1]
+    drawn = torch.rand(int(cell.max()) + 1, generator=torch.Generator().manual_seed(seed)) < CHECKED_SHARE
+    return points, points.seen & drawn.to(cell.device)[cell][point], cell
+
+
+def _approved(sight: Sight, offsets: Tensor, checked: Observations, cell: Tensor) -> tuple[Tensor, dict[str, Any]]:
     """[V] bool, views that the checked points say agree better through their offsets, and the disagreement by then."""
-    checked, cell = sight.checked, sight.checked_cell
     seen = look(sight.features, sight.K, sight.given, checked, sight.size)
     place = seen.pixel + _interpolated(offsets, *_footprints(seen.pixel, sight.size, offsets.shape[1]))
     value, _, inside = _sample(sight.features, place, sight.size)
     valid, old = seen.valid & inside, seen.value[..., None]
     good = torch.ones(len(offsets), dtype=torch.bool, device=offsets.device)
+    before = disagreement(old, valid, checked, CONTRAST_SCALE)
     # One view's return to its photograph changes what the others are compared with.
     while True:
         new = torch.where(good[:, None, None], value[..., None], old)
-        approved = improved(old, new, valid, checked, cell, CONTRAST_SCALE)
+        after = disagreement(new, valid, checked, CONTRAST_SCALE)
+        approved = improved(old, new, valid, checked, cell, CONTRAST_SCALE, CERTAIN) & (after < MARGIN * before)
         if approved[good].all():
             break
         good &= approved
     if not better(old, new, valid, checked, cell, CONTRAST_SCALE):
-        good, new = torch.zeros_like(good), old
-    before, after = (disagreement(values, valid, checked, CONTRAST_SCALE).nanmean() for values in (old, new))
-    return good, {"residual_before": _plain(before), "residual_after": _plain(after)}
+        good, after = torch.zeros_like(good), before
+    return good, {"residual_before": _plain(before.nanmean()), "residual_after": _plain(after.nanmean())}
 
 
 def _plain(value: Tensor) -> float | None:

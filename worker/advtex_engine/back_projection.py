@@ -49,6 +49,10 @@ def _lacking_detail(values: Tensor, labels: Tensor, view: ViewMaps, number: int)
     lacking = view.color[0][pixels].to(torch.float32) / 255 - (values[texels] * weights[..., None]).sum(1)
     sums = torch.zeros((view.width * view.height, 4), device=values.device)
     sums[pixels] = F.pad(lacking, (0, 1), value=1.0)
-    wide = F.avg_pool2d(sums.T.reshape(1, 4, view.height, view.width), 2 * DETAIL_REACH + 1, 1, DETAIL_REACH)
+    # Rows, then columns: 18 additions per pixel and not 81.
+    wide = sums.T.contiguous().view(1, 4, view.height, view.width)
+    for rows in (True, False):
+        size, padding = (2 * DETAIL_REACH + 1, 1), (DETAIL_REACH, 0)
+        wide = F.avg_pool2d(wide, size if rows else size[::-1], 1, padding if rows else padding[::-1])
     wide = wide.view(4, -1).T[pixels]
     return texels, weights, lacking - wide[:, :3] / wide[:, 3:]

@@ -56,7 +56,7 @@ METHOD_HELP: dict[Method, str] = {
     Method.adversarial_no_auxiliary: "the same without auxiliary views: what they are worth",
     Method.adversarial_no_condition: "the same without showing the discriminator the source view",
     Method.best_view: "each face from the view that shows it largest",
-    Method.colormap: "refined cameras, then the mean",
+    Method.colormap: "refined cameras and smoothly corrected photographs, then the mean",
     Method.l1: "least absolute difference to all views",
     Method.mean: "the mean of all views",
     Method.sharpest: "each face from the sharpest view that sees it",

@@ -16,6 +16,7 @@ from live_service import process_tree, wait_until
 from tiny_scan import write_zip
 
 from advtex_store.models import JobRow
+from advtex_store.records import POISON_DEATHS
 
 SCENES = 30
 STEPS = 40
@@ -52,12 +53,20 @@ def submit(manifest: Path, url: str, key: str, home: Path) -> None:
 
 
 def one_at_work(running: Fleet, after: int) -> int:
-    """The number of a worker that has a runner, another one each time where there are several."""
+    """The number of a worker that has a runner, another one each time where there are several.
+
+    Three deaths in a row without progress are poison, and a kill may come before the first step: a job that has died
+    twice is left in peace.
+    """
     found: list[int] = []
 
     def look() -> list[int]:
+        with running.store.database.read() as session:
+            at_work = session.query(JobRow).filter(JobRow.state == "running", JobRow.deaths < POISON_DEATHS - 1)
+            horses = {int(str(row.worker).rpartition("-")[2]) for row in at_work}
         order = ((after + n) % len(running.workers) for n in range(len(running.workers)))
-        found.extend(n for n in order if len(process_tree(running.workers[n].pid)) > 2)  # itself, RQ's horse, runner
+        trees = ((n, process_tree(running.workers[n].pid)) for n in order)
+        found.extend(n for n, tree in trees if len(tree) > 2 and horses & set(tree))  # itself, RQ's horse, runner
         return found
 
     wait_until(look, seconds=60)

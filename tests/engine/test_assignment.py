@@ -56,6 +56,13 @@ def camera_above(x: float, y: float, height: float) -> Camera:
     return Camera(K, pose, WIDTH, HEIGHT)
 
 
+def camera_below(x: float, y: float, depth: float) -> Camera:
+    """Looks straight up at the plane z = 0."""
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, 3] = -torch.tensor([x, y, -depth], dtype=torch.float64)
+    return Camera(camera_above(0, 0, 1).K, pose, WIDTH, HEIGHT)
+
+
 def maps_of(mesh: Mesh, cameras: list[Camera], images: list[Tensor] | None = None) -> ViewMaps:
     """View maps with gray images unless given."""
     gray = torch.full((HEIGHT, WIDTH, 3), 128, dtype=torch.uint8)
@@ -102,6 +109,26 @@ def test_the_nearer_view_is_better_and_a_hidden_or_outlying_face_has_none() -> N
     elsewhere = find_candidates(mesh, maps_of(mesh, [near, camera_above(5.0, 0.0, 1.0)]), 0.01)
     assert not bool((elsewhere.view == 1).any())
     assert bool((elsewhere.cost[elsewhere.view < 0] == NO_VIEW).all())
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["as scanners write it", "turned inside out"])
+def test_the_far_side_of_a_thin_wall_is_not_painted_with_what_its_near_side_shows(turned: bool) -> None:
+    floor, faces = grid(8, side=0.6)
+    under = torch.cat((faces, faces.flip(1) + len(floor)))
+    mesh = Mesh(torch.cat((floor, floor - torch.tensor([0.0, 0.0, 0.002]))), under.flip(1) if turned else under)
+    above, below = camera_above(0.0, 0.0, 0.7), camera_below(0.0, 0.0, 2.0)
+    candidates = find_candidates(mesh, maps_of(mesh, [above, below]), 0.01)
+    best = candidates.view.gather(1, candidates.cost.argmin(1)[:, None])[:, 0]
+    assert bool((best[:128] == 0).all())
+    assert bool((best[128:] == 1).all()), "it is better seen, were it not for the wall, from the other side"
+
+
+def test_where_windings_are_mixed_both_sides_of_a_face_count() -> None:
+    position, faces = grid(8, side=0.6)
+    mixed = torch.where((torch.arange(128) % 2 == 0)[:, None], faces, faces.flip(1))
+    maps = maps_of(Mesh(position, faces), [camera_above(0.0, 0.0, 1.0)])
+    one_way, both_ways = (find_candidates(Mesh(position, some), maps, 0.01) for some in (faces, mixed))
+    torch.testing.assert_close(one_way.cost, both_ways.cost)
 
 
 def test_only_the_best_views_are_kept_whatever_their_order() -> None:

@@ -6,7 +6,7 @@ K are kept while the views go by, so that memory does not grow with the number o
 the others are marked down.
 
 The data term is a sum of logarithms, each the factor by which another view of the same face is better:
-resolution (square root of the projected area), frontality, sharpness of the frame, distance from depth
+resolution (square root of the projected area), frontality, the right side, sharpness of the frame, distance from depth
 discontinuities and from the image's border, and agreement in color with the face's other candidates.
 """
 
@@ -18,8 +18,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from advtex_engine.rasterize import rasterize_views
 from advtex_engine.reproject import MIN_DEPTH
-from advtex_engine.scene import Mesh
+from advtex_engine.scene import Camera, Mesh
 from advtex_engine.texture import bilinear_footprint
 from advtex_engine.views import ViewMaps
 
@@ -33,7 +34,10 @@ SAFE_DISTANCE = 8
 # Neighboring pixels whose depths differ by more than this share of the depth belong to different surfaces.
 DEPTH_JUMP = 0.03
 MIN_SHARE = 0.5  # of a face's places must be seen
+ORIENTED_SHARE = 0.9  # of the pixels must show the same side of faces for the mesh to tell front from back
+ORIENTING_VIEWS = 12
 HIDDEN_WEIGHT = 6.0
+BEHIND_WEIGHT = 6.0
 GRAZING_WEIGHT = 0.5
 EDGE_WEIGHT = 1.0
 SHARPNESS_WEIGHT = 1.0
@@ -97,16 +101,54 @@ def find_candidates(mesh: Mesh, maps: ViewMaps, tolerance: float) -> Candidates:
         torch.zeros((faces, KEPT_VIEWS), device=device),
         torch.zeros((faces, KEPT_VIEWS, POINTS, 3), dtype=torch.uint8, device=device),
     )
-    blur = frame_blur(maps)
+    blur, front = frame_blur(maps), front_side(mesh, normal, maps)
     for view in range(maps.count):
-        _look(view, points, normal, maps, float(blur[view]), tolerance, kept)
+        _look(view, points, normal, front, maps, float(blur[view]), tolerance, kept)
     return replace(kept, disagreement=disagreement(kept.color, kept.view >= 0))
 
 
+def front_side(mesh: Mesh, normal: Tensor, maps: ViewMaps) -> int:
+    """1 if views see faces on the side of their normals [T,3], -1 if on the other, 0 if the mesh has no such order.
+
+    The far side of a wall that is thinner than the tolerance would else be painted with what its near side shows. Such
+    walls are the exception: what holds for ORIENTED_SHARE of the pixels holds for all.
+    """
+    center = mesh.v_pos[mesh.t_pos_idx].mean(1)
+    some = range(0, maps.count, -(-maps.count // ORIENTING_VIEWS))
+    front, count = torch.zeros((2, 1), device=center.device)
+    for view, seen in zip(some, rasterize_views(mesh, [_camera(maps, view) for view in some]), strict=True):
+        face = seen.face_index[seen.face_index >= 0]
+        front += ((normal[face] * _rays(center[face], maps, view)).sum(1) < 0).sum()
+        count += len(face)
+    share = float(front / count.clamp(min=1))
+    if ORIENTED_SHARE > share > 1 - ORIENTED_SHARE:
+        return 0
+    return 1 if share > 0.5 else -1
+
+
+def _camera(maps: ViewMaps, view: int) -> Camera:
+    fx, fy, cx, cy = maps.intrinsics[view].double().tolist()
+    K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+    return Camera(K, maps.world_to_camera[view].double().cpu(), maps.width, maps.height)
+
+
+def _rays(position: Tensor, maps: ViewMaps, view: int) -> Tensor:
+    """Unit vectors [P,3] from the camera to world points."""
+    center = -maps.world_to_camera[view, :3, :3].T @ maps.world_to_camera[view, :3, 3]
+    return F.normalize(position - center.to(position), dim=1)
+
+
 def _look(
-    view: int, points: FacePoints, normal: Tensor, maps: ViewMaps, blur: float, tolerance: float, kept: Candidates
+    view: int,
+    points: FacePoints,
+    normal: Tensor,
+    front: int,
+    maps: ViewMaps,
+    blur: float,
+    tolerance: float,
+    kept: Candidates,
 ) -> None:
-    """Puts a view into the places of worse ones, for the faces that it sees."""
+    """Puts a view into the places of worse ones, for the faces that it sees. front: as `front_side` says."""
     pixel, depth = _project(points.position, maps, view)
     inside = (depth > MIN_DEPTH) & (pixel > 0.5).all(1)
     inside &= (pixel[:, 0] < maps.width - 0.5) & (pixel[:, 1] < maps.height - 0.5)
@@ -117,15 +159,15 @@ def _look(
     safe, color = _sample(pixel, depth, needed.nonzero()[:, 0], maps, view, tolerance)
     at = safe[index]
     share = (at > 0).to(torch.float32).mean(1)
+    cosine = -(normal[face] * _rays(points.position[index[:, 6]], maps, view)).sum(1)
+    behind = cosine * front < 0
     enough = share > MIN_SHARE
-    face, index, at, share = face[enough], index[enough], at[enough], share[enough]
+    face, index, at, share, cosine, behind = (part[enough] for part in (face, index, at, share, cosine.abs(), behind))
     a, b, c = pixel[index[:, :3]].unbind(1)
     area = ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]).abs() / 2
-    center = -maps.world_to_camera[view, :3, :3].T @ maps.world_to_camera[view, :3, 3]
-    ray = F.normalize(points.position[index[:, 6]] - center.to(points.position), dim=1)
-    cosine = (normal[face] * ray).sum(1).abs()
     cost = -0.5 * area.clamp(min=1e-6).log() - GRAZING_WEIGHT * cosine.clamp(min=1e-3).log()
     cost += HIDDEN_WEIGHT * (1 - share) + EDGE_WEIGHT * (1 - at.amin(1)) + SHARPNESS_WEIGHT * blur
+    cost += BEHIND_WEIGHT * behind
     worst, place = kept.cost[face].max(1)
     better = cost < worst
     face, place = face[better], place[better]

@@ -5,8 +5,10 @@
 Every view is a cut of one picture, shifted by up to `shift` pixels. Compared with the truth are the L1 optimum
 (per-pixel median) and the texture with auxiliary views and, as the negative control, without: nearest patches both ways
 and the sliced Wasserstein distance of 7x7 patches, also as a share of the L1 optimum's. Scores are taken along the way,
-at a quarter, half, three quarters and the end. Writes planar.json, planar.md and planar.png below --results; goes on
-with missing runs when started again. The paper's size is --size 512 --shift 16, and a GPU's work.
+at a quarter, half, three quarters and the end. Arithmetic is in float32, the paper's, on every processor.
+
+Writes planar.json, planar.md and planar.png below --results; goes on with missing runs when started again. The paper's
+size is --size 512 --shift 16, and a GPU's work.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from torch import Tensor
 
 from advtex_engine.config import PRESETS
 from advtex_engine.discriminator import PatchDiscriminator
+from advtex_engine.examples import InputForm
 from advtex_engine.metrics import nearest_patch_loss, sliced_wasserstein
 from advtex_engine.optimize import AdversarialOptimizer
 from advtex_engine.pipeline import choose_device
@@ -78,6 +81,7 @@ def optimize(
         generator=torch.Generator(device).manual_seed(seed),
         discriminator=PatchDiscriminator(torch.Generator().manual_seed(seed)).to(device),
     )
+    optimizer.bfloat16, optimizer.form = False, InputForm()
     marks = {max(1, steps * quarter // 4) for quarter in (1, 2, 3, 4)}
     known = (maps.slot_map >= 0).cpu()
     for step in range(1, steps + 1):

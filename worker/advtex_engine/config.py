@@ -104,7 +104,9 @@ PRESETS: dict[str, Preset] = {
         max_crop=None,
     ),
     "standard": STANDARD,
-    "preview": Preset(levels=(PyramidLevel(1_500, scale=2), PyramidLevel(400)), start="mean", l1_decays=8),
+    "preview": replace(
+        STANDARD, levels=(PyramidLevel(1_200, scale=2), PyramidLevel(400)), pretraining=160, averaging=100
+    ),
 }
 METHODS = (
     "adversarial",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -46,7 +47,8 @@ def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     run = _Run(saved["level"], saved["step"], saved["losses"]) if saved else _Run(0, 0, [])
     if saved:
         given.live.quality = saved["quality"]
-    texture = _start(given)
+    start = _start(given)
+    texture = start
     for number, level in enumerate(preset.levels):
         if number < run.level:
             continue
@@ -57,7 +59,7 @@ def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
         optimizer = AdversarialOptimizer(
             views.maps,
             views.pairs,
-            _compact(maps, texture),
+            _resized(texture, maps.slot_map.shape)[maps.slot_map >= 0],
             preset,
             kind=given.scene.kind,
             steps=preset.steps,
@@ -70,7 +72,7 @@ def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
             views.load_state_dict(saved["views"])
             saved = None
         _run_level(given, optimizer, views, run, sum(part.steps for part in preset.levels[: number + 1]), checkpoints)
-        texture = dense_texture(maps, optimizer.result)
+        texture = _refined(start, dense_texture(maps, optimizer.result))
         del optimizer, views  # before the next level makes its own
         run.level = number + 1
     return texture.clamp(0, 1), run.losses
@@ -124,17 +126,24 @@ def _run_level(
 
 
 def _start(given: MethodInput) -> Tensor:
-    """The first level's dense start in [0,1]."""
+    """The dense start [H,W,3] in [0,1], at full size."""
     if given.start is not None:
         return given.start
-    first = given.means[given.preset.levels[0].scale]
-    return torch.zeros_like(first) if given.preset.start == "zero" else first
+    mean = given.means[1]
+    return torch.zeros_like(mean) if given.preset.start == "zero" else mean
 
 
-def _compact(maps: ViewMaps, texture: Tensor) -> Tensor:
-    """Rows [slots,3] of a dense texture [H,W,3], resampled to the maps' texture size."""
-    height, width = maps.slot_map.shape
+def _refined(start: Tensor, texture: Tensor) -> Tensor:
+    """The start with what a texture of smaller size changed in it; it keeps the detail that the smaller one lacks."""
+    if texture.shape == start.shape:
+        return texture
+    return start + _resized(texture - _resized(start, texture.shape), start.shape)
+
+
+def _resized(texture: Tensor, shape: Sequence[int]) -> Tensor:
+    """A dense texture [H,W,3] at the size `shape` [h,w,...], without aliasing."""
+    if texture.shape[:2] == tuple(shape[:2]):
+        return texture
     image = texture.permute(2, 0, 1)[None]
-    if texture.shape[:2] != (height, width):
-        image = F.interpolate(image, (height, width), mode="bilinear", align_corners=False)
-    return image[0].permute(1, 2, 0)[maps.slot_map >= 0]
+    image = F.interpolate(image, tuple(shape[:2]), mode="bilinear", align_corners=False, antialias=True)
+    return image[0].permute(1, 2, 0)

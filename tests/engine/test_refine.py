@@ -13,6 +13,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
+from wavy_sheet import FOCAL, HEIGHT, WIDTH, camera_over, paint, sheet
 
 from advtex_engine.cameras import project
 from advtex_engine.config import TextureConfig
@@ -35,46 +36,9 @@ from advtex_engine.refine_solve import Anchor, residuals, solve_views, weighted_
 from advtex_engine.scene import Camera, Mesh, Scene, View
 from advtex_engine.synthesize import synthesize
 
-WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
 VIEWS = 10
 CPU = torch.device("cpu")
 SCANS = Path(os.environ.get("ADVTEX_DATA", Path(__file__).parents[2].parent / "shared" / "data")) / "scans"
-
-
-def relief() -> Mesh:
-    """A sheet of 2 x 2 m with hills of 20 cm, in the plane z = 0, 40 x 40 squares."""
-    side = torch.linspace(-1, 1, 41)
-    y, x = torch.meshgrid(side, side, indexing="ij")
-    z = 0.1 * torch.sin(4 * x) * torch.cos(3 * y)
-    corner = (torch.arange(40)[:, None] * 41 + torch.arange(40)).flatten()
-    first = torch.stack((corner, corner + 1, corner + 42), 1)
-    second = torch.stack((corner, corner + 42, corner + 41), 1)
-    return Mesh(torch.stack((x, y, z), -1).reshape(-1, 3), torch.cat((first, second)))
-
-
-def paint(points: Tensor) -> Tensor:
-    """Colors [...,3] in [0.1,0.8] of surface points: waves of 6 to 60 cm in all directions."""
-    generator = torch.Generator().manual_seed(5)
-    waves = torch.rand(40, 2, generator=generator) * 2 - 1
-    waves = waves / waves.norm(dim=1, keepdim=True) * torch.logspace(1, 2, 40)[:, None]
-    phase = 2 * math.pi * torch.rand(3, 40, generator=generator)
-    angles = (points[..., :2].float() @ waves.T)[..., None, :] + phase
-    return 0.45 + 0.35 * torch.tanh(angles.sin().mean(-1) * 4)
-
-
-def camera_over(index: int) -> Camera:
-    """One of VIEWS cameras on a circle 1.6 m above the relief, looking at places around its middle."""
-    turn = 2 * math.pi * index / VIEWS
-    center = torch.tensor([0.7 * math.cos(turn), 0.7 * math.sin(turn), 1.6], dtype=torch.float64)
-    forward = torch.tensor([0.2 * math.sin(3 * turn), 0.2 * math.cos(2 * turn), 0.0], dtype=torch.float64) - center
-    forward = forward / forward.norm()
-    right = torch.linalg.cross(forward, torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
-    right = right / right.norm()
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.stack((right, torch.linalg.cross(forward, right), forward))
-    pose[:3, 3] = -pose[:3, :3] @ center
-    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64)
-    return Camera(K, pose, WIDTH, HEIGHT)
 
 
 def photograph(mesh: Mesh, camera: Camera, name: str, gain: Tensor, offset: float) -> View:
@@ -94,9 +58,9 @@ def gains() -> Tensor:
 
 @pytest.fixture(scope="module")
 def true_scene(gains: Tensor) -> Scene:
-    mesh = relief()
-    views = [photograph(mesh, camera_over(i), f"view{i}", gains[i], 0.01 * (-1) ** i) for i in range(VIEWS)]
-    held = photograph(mesh, camera_over(1), "held", torch.tensor([1.3, 1.0, 0.8]), 0.0)
+    mesh = sheet(2.0, 40, (0.1, 4, 3, 0))
+    views = [photograph(mesh, camera_over(i, VIEWS), f"view{i}", gains[i], 0.01 * (-1) ** i) for i in range(VIEWS)]
+    held = photograph(mesh, camera_over(1, VIEWS), "held", torch.tensor([1.3, 1.0, 0.8]), 0.0)
     return Scene(mesh, tuple(views), (held,))
 
 
@@ -267,7 +231,7 @@ def test_correction_keeps_clipped_highlights_and_order(gain: float, offset: floa
 @given(st.lists(st.floats(-0.5, 0.5), min_size=6, max_size=6))
 def test_a_motion_of_all_cameras_is_taken_out_again(values: list[float]) -> None:
     motion = exponential(torch.tensor([values], dtype=torch.float64))[0]
-    cameras = torch.stack([camera_over(i).world_to_camera for i in range(4)])
+    cameras = torch.stack([camera_over(i, VIEWS).world_to_camera for i in range(4)])
     points = torch.rand(50, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     every = torch.arange(50).expand(4, -1)
     seen = Observations(points, every, torch.ones_like(every, dtype=torch.bool))
@@ -350,7 +314,7 @@ def test_points_behind_something_and_near_its_outline_are_not_observed() -> None
     wall = torch.tensor([[-2.0, -2, 2], [2, -2, 2], [2, 2, 2], [-2, 2, 2]])
     card = torch.tensor([[-0.2, -0.2, 1.0], [0.2, -0.2, 1], [0.2, 0.2, 1], [-0.2, 0.2, 1]])
     mesh = Mesh(torch.cat((wall, card)), torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]))
-    camera = replace(camera_over(0), world_to_camera=torch.eye(4, dtype=torch.float64))
+    camera = replace(camera_over(0, VIEWS), world_to_camera=torch.eye(4, dtype=torch.float64))
     view = View("view", camera, torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8))
     cameras, depths = surface_depths(mesh, (view,), (WIDTH, HEIGHT), "scene")
     # On the card; on the wall behind it; just beside its outline as seen from here; well beside.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from wavy_sheet import HEIGHT, WIDTH, camera_over, paint, sheet
 
 from advtex_engine.checkpoint import WorkFolder
 from advtex_engine.config import PRESETS, TextureConfig
@@ -29,49 +29,10 @@ from advtex_engine.scene import Atlas, Camera, Mesh, Scene, View
 from advtex_engine.texture import bilinear_footprint
 from advtex_engine.views import build_view_maps
 
-WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
 VIEWS = 8
 WARPED = 2  # one view alone: the place that all agree on is that of the others
 SIDE = 400  # texels, of a centimetre
 CPU = torch.device("cpu")
-
-
-def sheet(height: float) -> Mesh:
-    """4 x 4 m in the plane z = 0, with hills of that many metres; 60 x 60 squares, uv as it lies."""
-    side = torch.linspace(-2, 2, 61)
-    y, x = torch.meshgrid(side, side, indexing="ij")
-    z = height * torch.sin(5 * x + 1) * torch.cos(4 * y)
-    corner = (torch.arange(60)[:, None] * 61 + torch.arange(60)).flatten()
-    faces = torch.cat(
-        (torch.stack((corner, corner + 1, corner + 62), 1), torch.stack((corner, corner + 62, corner + 61), 1))
-    )
-    position = torch.stack((x, y, z), -1).reshape(-1, 3)
-    return Mesh(position, faces, (position[:, :2] + 2) / 4, faces)
-
-
-def paint(points: Tensor) -> Tensor:
-    """Colors [...,3] in [0.1,0.8] of surface points by their x and y: waves of 6 to 60 cm in all directions."""
-    generator = torch.Generator().manual_seed(5)
-    waves = torch.rand(40, 2, generator=generator) * 2 - 1
-    waves = waves / waves.norm(dim=1, keepdim=True) * torch.logspace(1, 2, 40)[:, None]
-    phase = 2 * math.pi * torch.rand(3, 40, generator=generator)
-    angles = (points[..., :2].float() @ waves.T)[..., None, :] + phase
-    return 0.45 + 0.35 * torch.tanh(angles.sin().mean(-1) * 4)
-
-
-def camera_over(index: int) -> Camera:
-    """One of VIEWS cameras on a circle 1.6 m above the sheet, looking at places around its middle."""
-    turn = 2 * math.pi * index / VIEWS
-    center = torch.tensor([0.7 * math.cos(turn), 0.7 * math.sin(turn), 1.6], dtype=torch.float64)
-    forward = torch.tensor([0.2 * math.sin(3 * turn), 0.2 * math.cos(2 * turn), 0.0], dtype=torch.float64) - center
-    forward = forward / forward.norm()
-    right = torch.linalg.cross(forward, torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
-    right = right / right.norm()
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.stack((right, torch.linalg.cross(forward, right), forward))
-    pose[:3, 3] = -pose[:3, :3] @ center
-    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64)
-    return Camera(K, pose, WIDTH, HEIGHT)
 
 
 def pixels() -> Tensor:
@@ -104,14 +65,14 @@ def photograph(mesh: Mesh, camera: Camera, name: str, *, warped: bool = False) -
 
 @pytest.fixture(scope="module")
 def exact() -> Scene:
-    mesh = sheet(0.1)
-    return Scene(mesh, tuple(photograph(mesh, camera_over(i), f"view{i}") for i in range(VIEWS)))
+    mesh = sheet(4.0, 60, (0.1, 5, 4, 1))
+    return Scene(mesh, tuple(photograph(mesh, camera_over(i, VIEWS), f"view{i}") for i in range(VIEWS)))
 
 
 @pytest.fixture(scope="module")
 def bent(exact: Scene) -> Scene:
     """The scene with one photograph that is warped."""
-    other = photograph(exact.mesh, camera_over(WARPED), f"view{WARPED}", warped=True)
+    other = photograph(exact.mesh, camera_over(WARPED, VIEWS), f"view{WARPED}", warped=True)
     return replace(exact, views=(*exact.views[:WARPED], other, *exact.views[WARPED + 1 :]))
 
 
@@ -245,7 +206,7 @@ def test_the_fit_without_evidence_does_not_move() -> None:
 
 def test_with_wrong_geometry_colormap_is_closer_to_the_truth_than_the_mean(exact: Scene, tmp_path: Path) -> None:
     """The hills are taken for a plane: what is 10 cm off moves in the views by several pixels."""
-    scene = replace(exact, mesh=sheet(0.0))
+    scene = replace(exact, mesh=sheet(4.0, 60, (0.0, 5, 4, 1)))
     scene = apply_refinement(scene, refine_cameras(scene, CPU, 0))
     atlas = Atlas(scene.mesh, SIDE, SIDE, "scan", 1)
     maps = build_view_maps(atlas, scene.views, scene.kind)

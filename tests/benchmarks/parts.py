@@ -62,6 +62,7 @@ VARIANTS = {
     "view selection": Variant("view_selection"),
     "the whole": Variant(),
     "without refined cameras": Variant(refine=False),
+    "without refined cameras and without alignment": Variant(refine=False, changes={"alignment": False}),
     "from the mean, not from view selection": Variant(changes={"start": "mean"}),
     "without alignment in the loop": Variant(changes={"alignment": False}),
     "without feature matching": Variant(changes={"feature_weight": 0.0}),

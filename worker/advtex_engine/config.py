@@ -105,7 +105,7 @@ PRESETS: dict[str, Preset] = {
     ),
     "standard": STANDARD,
     "preview": replace(
-        STANDARD, levels=(PyramidLevel(1_200, scale=2), PyramidLevel(400)), pretraining=160, averaging=100
+        STANDARD, levels=(PyramidLevel(800, scale=2), PyramidLevel(300)), pretraining=120, averaging=100
     ),
 }
 METHODS = (

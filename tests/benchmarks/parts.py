@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import torch
 from harness import (
     SCAN_SCORES,
@@ -43,7 +44,7 @@ from advtex_engine.config import TextureConfig
 from advtex_engine.methods import MethodInput
 from advtex_engine.perceptual import Lpips
 from advtex_engine.pipeline import choose_device, resolve_preset
-from advtex_engine.previews import BACKGROUND, contact_sheet, render_view
+from advtex_engine.previews import contact_sheet, render_view
 from advtex_engine.scene import View
 from advtex_engine.synthesize import synthesize
 
@@ -68,7 +69,7 @@ VARIANTS = {
     "without feature matching": Variant(changes={"feature_weight": 0.0}),
 }
 SHOWN = ("mean", "view selection", "the whole")
-SHOWN_VIEW = 1  # of the held-out ones
+SHOWN_VIEW = 4  # of the held-out ones
 HOLDOUT, SCAN_FACES = 8, 80_000  # of scans of one's own
 
 
@@ -111,7 +112,7 @@ def fill(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
                 scores = score_texture(given.atlas, texture, truth, lpips)
                 results.add(settings_of(arguments, model, name), scores, seconds)
             if set(SHOWN) <= shown.keys():
-                draw(arguments.results / f"object_{model}.png", truth, [shown[name] for name in SHOWN])
+                draw(arguments.results / f"object_{model}.png", scan, truth, [shown[name] for name in SHOWN])
 
 
 def fill_scans(arguments: argparse.Namespace, results: Results) -> None:
@@ -151,13 +152,10 @@ def textures(
         yield name, given, texture, watch.seconds
 
 
-def draw(path: Path, truth: Truth, pictures: list[Tensor]) -> None:
+def draw(path: Path, scan: Path, truth: Truth, pictures: list[Tensor]) -> None:
     """A photograph from a held-out place beside what the shown variants give there."""
-    camera, image = (
-        truth.cameras[SHOWN_VIEW],
-        truth.images[SHOWN_VIEW] + BACKGROUND * ~truth.covers[SHOWN_VIEW][..., None],
-    )
-    photograph = View("held out", camera, (image.clamp(0, 1) * 255).round().to(torch.uint8))
+    file = sorted((scan / "truth" / "heldout").iterdir())[SHOWN_VIEW]
+    photograph = View("held out", truth.cameras[SHOWN_VIEW], torch.from_numpy(cv2.imread(str(file))[..., ::-1].copy()))
     contact_sheet([photograph], [pictures], SHOWN, path)
 
 

@@ -18,6 +18,7 @@ from starlette.concurrency import run_in_threadpool
 from advtex_contract.jobs import JobState
 from advtex_server.settings import ServerSettings
 from advtex_store.errors import StaleAttempt, StoreError
+from advtex_store.models import JobRow
 from advtex_store.queue import WorkerClass
 from advtex_store.retention import Retention
 from advtex_store.store import Store
@@ -80,37 +81,51 @@ class Dispatcher:
     def dispatch(self) -> int:
         """Offer the attempts that are next to workers that they fit. -> how many were new to Redis.
 
-        Small workers choose first, so that large ones are free for what fits nowhere else. Few attempts are in Redis at
-        a time: who comes next is decided here, from the rows, as late as possible. RedisError when Redis is away.
+        Idle workers come first, so that no attempt waits behind a busy one; then a few attempts are put where they will
+        wait. Small workers choose first, so that large ones are free for what fits nowhere else. Few attempts are in
+        Redis at a time: who comes next is decided here, from the rows, as late as possible. RedisError when Redis is
+        away.
         """
         queue = self.store.queue
         try:
             classes = queue.classes()
             queue.withdraw({found.gib for found in classes})
-            offered_before = {found.gib: len(queue.waiting_ids(found.gib)) for found in classes}
-            in_redis = sum(offered_before.values())
-            offered = 0
+            waiting = {found.gib: len(queue.waiting_ids(found.gib)) for found in classes}
+            before = sum(waiting.values())
             for found in classes:
-                room = found.workers * self.settings.queue_depth - offered_before[found.gib]
-                new = self._offer(found, room, in_redis + offered)
-                offered += new
+                waiting[found.gib] += self._offer(found, found.idle - waiting[found.gib], sum(waiting.values()))
+            for found in classes:
+                room = found.workers * self.settings.queue_depth - waiting[found.gib]
+                waiting[found.gib] += self._offer(found, room, sum(waiting.values()))
+            for found in classes:
+                waiting[found.gib] += self._offer_preempted(found, sum(waiting.values()))
         except RedisError:
             self.store.records.explain(REDIS_AWAY)
             raise
         self._explain(classes)
-        return offered
+        return sum(waiting.values()) - before
 
     def _offer(self, to: WorkerClass, room: int, in_redis: int) -> int:
-        """The next attempts to one class. A preempted one is not kept waiting for room. -> how many were new."""
+        """The next attempts to one class, as far as there is room. -> how many were new."""
         offered = 0
-        for row in self.store.records.waiting(max(room, 1) + in_redis, to.memory_bytes):
-            preempted = row.state == JobState.preempted
-            if offered >= room and not preempted:
+        if room <= 0:
+            return 0
+        for row in self.store.records.waiting(room + in_redis, to.memory_bytes):
+            if offered == room:
                 break
-            if self.store.queue.offer(row.id, row.attempt, to.gib, front=preempted):
-                log.info("enqueued", job=row.id, attempt=row.attempt, worker_gib=to.gib)
-                offered += 1
+            offered += self._offer_row(row, to)
         return offered
+
+    def _offer_preempted(self, to: WorkerClass, in_redis: int) -> int:
+        """What had to give its worker back is not kept waiting for room. -> how many were new."""
+        rows = self.store.records.waiting(1 + in_redis, to.memory_bytes)
+        return sum(self._offer_row(row, to) for row in rows if row.state == JobState.preempted)
+
+    def _offer_row(self, row: JobRow, to: WorkerClass) -> bool:
+        if not self.store.queue.offer(row.id, row.attempt, to.gib, front=row.state == JobState.preempted):
+            return False
+        log.info("enqueued", job=row.id, attempt=row.attempt, worker_gib=to.gib)
+        return True
 
     def _explain(self, classes: Sequence[WorkerClass]) -> None:
         if not classes:

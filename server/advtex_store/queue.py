@@ -27,15 +27,17 @@ QUEUE = "advtex-"
 TASK = "advtex_worker.tasks.run_job"
 STARTED_GRACE_SECONDS = 10.0  # between taking an id and claiming the row; later the taker is held for dead
 PRESENCE = "advtex:worker:"
+BUSY = " busy"
 PRESENCE_SECONDS = 20  # a worker that has not announced itself for so long is gone
 
 
 @dataclass(frozen=True, slots=True)
 class WorkerClass:
-    """Living workers on which jobs may use `gib` GiB of memory."""
+    """Living workers on which jobs may use `gib` GiB of memory; `idle` of them have none."""
 
     gib: int
     workers: int
+    idle: int
 
     @property
     def memory_bytes(self) -> int:
@@ -72,9 +74,10 @@ class JobQueue:
     def __init__(self, redis: Redis) -> None:
         self.redis = redis
 
-    def announce(self, name: str, gib: int, connection: Any = None) -> None:
+    def announce(self, name: str, gib: int, connection: Any = None, *, busy: bool = False) -> None:
         """The worker `name` lives. Called by it every few seconds; `connection` may be a pipeline."""
-        (connection or self.redis).set(PRESENCE + name, gib, ex=PRESENCE_SECONDS)
+        told = f"{gib}{BUSY}" if busy else str(gib)
+        (connection or self.redis).set(PRESENCE + name, told, ex=PRESENCE_SECONDS)
 
     def depart(self, name: str) -> None:
         """The worker has ended."""
@@ -90,8 +93,10 @@ class JobQueue:
         """The classes of which workers live, smallest first."""
         names = self.workers()
         told = self.redis.mget([PRESENCE + name for name in names]) if names else []
-        count = Counter(int(gib) for gib in told if gib is not None)
-        return [WorkerClass(gib, workers) for gib, workers in sorted(count.items())]
+        known = [_text(value) for value in told if value is not None]
+        count = Counter(int(value.removesuffix(BUSY)) for value in known)
+        idle = Counter(int(value) for value in known if not value.endswith(BUSY))
+        return [WorkerClass(gib, workers, idle[gib]) for gib, workers in sorted(count.items())]
 
     def offer(self, job_id: str, attempt: int, gib: int, *, front: bool = False) -> bool:
         """Enqueue an attempt unless Redis holds it already, in whichever queue. -> whether it was enqueued.

@@ -123,6 +123,25 @@ def test_a_preempted_job_is_next_even_if_no_place_is_free(store: Store) -> None:
     assert in_redis(store) == [f"{second}-2", f"{first}-1"]
 
 
+def test_no_job_waits_behind_a_busy_worker_while_another_is_idle(store: Store) -> None:
+    only_workers(store, GIB, 2 * GIB)
+    store.queue.announce("only-0", GIB, busy=True)
+    jobs = [submit(store, gib=1) for _ in range(3)]
+    Dispatcher(store, settings(store)).dispatch()
+    assert in_redis(store, 2 * GIB) == [f"{jobs[0]}-1"]
+    assert in_redis(store) == [f"{jobs[1]}-1"], "one may wait"
+
+
+def test_preempted_jobs_spread_over_all_workers(store: Store) -> None:
+    only_workers(store, GIB, GIB, 2 * GIB)
+    jobs = [submit(store, gib=1) for _ in range(3)]
+    for job in jobs:
+        store.records.claim(job, 1, "w")
+        store.records.preempt(job, 1)
+    Dispatcher(store, settings(store)).dispatch()
+    assert (len(in_redis(store)), len(in_redis(store, 2 * GIB))) == (2, 1)
+
+
 def test_owners_take_turns_and_their_priorities_are_their_own(store: Store) -> None:
     many = [submit(store, "many", priority=priority) for priority in (0, 0, 5, 100)]
     few = [submit(store, "few") for _ in range(2)]

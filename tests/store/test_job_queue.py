@@ -108,11 +108,13 @@ def test_workers_that_announce_themselves_make_classes(queue: JobQueue) -> None:
     queue.announce("a", class_of((24 << 30) + 1))
     queue.announce("b", 24)
     queue.announce("c", class_of((8 << 30) - 1))
-    assert queue.classes() == [WorkerClass(7, 1), WorkerClass(24, 2)]
+    assert queue.classes() == [WorkerClass(7, 1, 1), WorkerClass(24, 2, 2)]
+    queue.announce("b", 24, busy=True)
+    assert queue.classes() == [WorkerClass(7, 1, 1), WorkerClass(24, 2, 1)]
     assert 0 < queue.redis.ttl(PRESENCE + "a") <= PRESENCE_SECONDS, "the dead are forgotten"
     queue.depart("a")
     queue.depart("c")
-    assert queue.classes() == [WorkerClass(24, 1)]
+    assert queue.classes() == [WorkerClass(24, 1, 0)]
 
 
 def test_what_waits_for_a_class_that_is_gone_is_taken_back(queue: JobQueue) -> None:

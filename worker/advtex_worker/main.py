@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from types import FrameType
 from typing import Any
@@ -54,6 +55,7 @@ class JobWorker(Worker):
         self._gib = gib
         self._parent_pid = os.getpid()
         self._presence = JobQueue(connection)
+        self._busy = False
         self._known_as = f"{socket.gethostname()}-{self._parent_pid}"
         super().__init__(
             [queue_name(gib)],
@@ -65,11 +67,14 @@ class JobWorker(Worker):
 
     def register_birth(self) -> None:
         super().register_birth()  # type: ignore[no-untyped-call]
-        self._presence.announce(self._known_as, self._gib)
+        self._announce()
+
+    def _announce(self, pipeline: Any = None) -> None:
+        self._presence.announce(self._known_as, self._gib, pipeline, busy=self._busy)
 
     def heartbeat(self, timeout: int | None = None, pipeline: Any = None) -> None:
         super().heartbeat(timeout, pipeline)
-        self._presence.announce(self._known_as, self._gib, pipeline)
+        self._announce(pipeline)
 
     def register_death(self) -> None:
         self._presence.depart(self._known_as)
@@ -88,7 +93,17 @@ class JobWorker(Worker):
         """The work-horse inherits the context: its lines and RQ's own name the job in both processes."""
         job_id, attempt = attempt_of(job.id)
         with structlog.contextvars.bound_contextvars(job=job_id, attempt=attempt):
-            super().execute_job(job, queue)
+            self._tell(busy=True)
+            try:
+                super().execute_job(job, queue)
+            finally:
+                self._tell(busy=False)
+
+    def _tell(self, *, busy: bool) -> None:
+        """At once: until the next sign of life the dispatcher would count on a worker that has a job."""
+        self._busy = busy
+        with suppress(RedisError):
+            self._announce()
 
     def fork_work_horse(self, job: Any, queue: Any) -> None:
         """Signals wait until both processes know which one they are."""

@@ -156,7 +156,8 @@ def work(host: Host, slot: Slot) -> None:
             if not stopping.is_set():
                 log.warning("the connection to Redis broke; connecting again")
         except RedisError as error:
-            log.warning("Redis cannot be reached; trying again", error=str(error))
+            if not stopping.is_set():  # else the signal came in the middle of a command
+                log.warning("Redis cannot be reached; trying again", error=str(error))
         try:
             stopping.wait(RECONNECT_SECONDS)
         except StopRequested:  # the last worker's signal handler

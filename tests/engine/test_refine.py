@@ -28,7 +28,7 @@ from advtex_engine.refine import (
     refinement_from_dict,
     refinement_to_dict,
 )
-from advtex_engine.refine_exposure import corrected_color
+from advtex_engine.refine_exposure import corrected_color, fit_exposure
 from advtex_engine.refine_points import Candidates, Observations, observe, surface_depths
 from advtex_engine.refine_pose import exponential, keep_gauge, local_contrast, look, pose_jacobian, twist
 from advtex_engine.refine_sight import look_at
@@ -117,6 +117,36 @@ def test_exposures_are_found_and_the_mean_stays(gains: Tensor, refined: tuple[Sc
         assert (corrected - level).abs().mean() < 0.15 * (photographed - level).abs().mean()
     assert refinement.gain.log().mean(0).abs().max() < 0.01
     assert refinement.offset.mean(0).abs().max() < 0.005
+
+
+def test_a_camera_that_adapts_on_its_way_leaves_each_place_as_it_was_photographed() -> None:
+    """24 views along a wall, brighter by a fifth from one end to the other, and each by its own chance on top of it."""
+    views, seen = 24, 200
+    generator = torch.Generator().manual_seed(0)
+    paint = 0.25 + 0.4 * torch.rand((views + 6) * 40, 3, generator=generator)
+    place = torch.arange(views)[:, None] * 40 + torch.arange(seen)
+    drift = torch.linspace(-0.1, 0.1, views)
+    gain = torch.exp(drift + 0.03 * torch.randn(views, generator=generator))
+    color = paint[place] * gain[:, None, None]
+    valid = torch.ones((views, seen), dtype=torch.bool)
+    points = Observations(torch.zeros((len(paint), 3), dtype=torch.float64), place, valid)
+    found, offset = fit_exposure(color, valid, points)
+    corrected = color * found[:, None] + offset[:, None]
+
+    def brightness(shown: Tensor) -> Tensor:
+        """[P], of each place on average, relative to its paint."""
+        mean, _ = weighted_mean((shown / paint[place]).mean(2), valid.float(), points)
+        return mean[seen:-seen]
+
+    def spread(shown: Tensor) -> Tensor:
+        """Of what the views see at a place."""
+        return torch.stack([residuals(part, valid, points, 1.0)[0] for part in shown.unbind(2)]).abs().mean()
+
+    ends = brightness(corrected)[[0, -300]]
+    assert brightness(color)[[0, -300]].diff() > 0.1
+    assert ends.diff() > 0.08
+    assert (brightness(corrected) - brightness(color)).abs().max() < 0.03
+    assert spread(corrected) < 0.6 * spread(color)
 
 
 def test_the_report_says_what_happened_to_each_frame(refined: tuple[Scene, Refinement]) -> None:

@@ -2,7 +2,8 @@
 
 Corrected color = gain * color + offset, in sRGB values of [0, 1] (a camera's exposure is nearly a gain there too).
 What all frames share cannot be known: the gains' geometric mean and the offsets' mean stay 1 and 0, so nothing as a
-whole turns gray or dark.
+whole turns gray or dark. The same holds for places: a camera that adapts to what it sees brightens dark corners, and
+each place keeps on average the colors that it was photographed with. What goes is what neighboring frames disagree on.
 """
 
 from __future__ import annotations
@@ -12,11 +13,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advtex_engine.refine_points import Observations
-from advtex_engine.refine_solve import residuals, solve_views
+from advtex_engine.refine_solve import Anchor, residuals, solve_views
 
 DARK, BRIGHT = 0.02, 0.96  # values beyond are clipped and say nothing about exposure
 ROBUST_SCALE = 0.05  # residual at which an observation loses half of its weight
 GAIN_PRIOR, OFFSET_PRIOR = 0.003, 0.1  # of the number of observations: towards 1 and 0
+ANCHOR = 0.5  # pull of each place's mean color towards that of the photographs as they are, relative to the evidence
 ROUNDS = 4
 GAIN_RANGE = (0.5, 2.0)
 OFFSET_RANGE = (-0.1, 0.1)
@@ -35,10 +37,11 @@ def fit_exposure(color: Tensor, valid: Tensor, points: Observations) -> tuple[Te
     for channel in color.unbind(-1):
         jacobian = torch.stack((channel, torch.ones_like(channel)), 1)
         change = torch.zeros((len(channel), 2), dtype=channel.dtype, device=channel.device)
+        anchor = Anchor((jacobian,), ANCHOR * clear.to(channel.dtype), points)
         for _ in range(ROUNDS):
             corrected = channel + (change[:, None] @ jacobian)[:, 0]
             residual, weight = residuals(corrected, clear, points, ROBUST_SCALE)
-            change = change + solve_views(jacobian, residual, weight, points, prior, change)
+            change = change + solve_views(jacobian, residual, weight, points, prior, change, anchor)
         gain, offset = (1 + change[:, 0]).clamp(*GAIN_RANGE), change[:, 1]
         share = count[:, 0] / count.sum().clamp(min=1)
         common = (gain.log() * share).sum().exp()

@@ -2,8 +2,9 @@
 
     python tests/benchmarks/sparsity.py [--every 1 2 5 10 20] [--methods l1 view_selection adversarial]
 
-`adversarial_virtual` adds the virtual cameras that the paper's supplement D proposes for sparse views: each auxiliary
-camera is moved at random, by up to PERTURBATION of the view's width in its image.
+Of two scans: `default`, as `advtex-engine synthesize` makes it, and `geometry`, the study's with errors of the geometry
+at its middle level. `adversarial_virtual` adds the virtual cameras that the paper's supplement D proposes for sparse
+views: each auxiliary camera is moved at random, by up to PERTURBATION of the view's width in its image.
 
 Writes sparsity.json, sparsity.md and sparsity.png below --results; goes on with missing cells when run again. In the
 table, `share` is the LPIPS over that of the same method with all views.
@@ -36,6 +37,7 @@ from harness import (
     score_texture,
     write_report,
 )
+from study import make_scan
 
 from advtex_engine.config import METHODS
 from advtex_engine.perceptual import Lpips
@@ -43,13 +45,19 @@ from advtex_engine.pipeline import choose_device, resolve_preset
 from advtex_engine.synthesize import synthesize
 
 VIRTUAL, PERTURBATION = "adversarial_virtual", 0.01
+SCANS = {
+    "default": "A scan with errors of cameras and geometry, as `advtex-engine synthesize` makes it",
+    "geometry": "The study's scan with errors of the geometry, n = 2.75",
+}
+MIDDLE_LEVEL = 2.75
 SHOWN = ("l1", "view_selection", "adversarial", VIRTUAL)
 
 
 def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
     parser = common_arguments("sparsity", __doc__)
     parser.add_argument("--every", nargs="+", type=int, default=[1, 2, 5, 10, 20])
-    parser.add_argument("--seed", type=int, default=0, help="of the scan")
+    parser.add_argument("--scans", nargs="+", default=list(SCANS), choices=SCANS)
+    parser.add_argument("--seed", type=int, default=0, help="of the scans")
     parser.add_argument("--methods", nargs="+", default=SHOWN, choices=[*METHODS, VIRTUAL])
     parsed: argparse.Namespace = parser.parse_args(line)
     return parsed
@@ -57,30 +65,32 @@ def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
 
 def cells(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """The settings of every cell, those that share a selection of views one after the other."""
-    for every in arguments.every:
-        for method in arguments.methods:
-            shared = ("views", "size", "steps", "preset", "faces", "refine", "seed")
-            yield {"every": every, "method": method, **{name: getattr(arguments, name) for name in shared}}
+    shared = ("views", "size", "steps", "preset", "faces", "refine", "seed")
+    for scan in arguments.scans:
+        for every in arguments.every:
+            for method in arguments.methods:
+                cell = {"scan": scan, "every": every, "method": method}
+                yield cell | {name: getattr(arguments, name) for name in shared}
 
 
 def fill(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
     """Runs every cell that is not in the results yet."""
-    missing = [cell for cell in cells(arguments) if results.find(cell) is None]
-    if not missing:
-        return
     device = choose_device(arguments.device)
-    width, height = parsed_size(arguments.size)
     with tempfile.TemporaryDirectory(prefix="advtex-sparsity-") as folder:
         scan = Path(folder) / "scan"
-        synthesize(scan, views=arguments.views, width=width, height=height, seed=arguments.seed)
-        truth = load_truth(scan)
-        every = 0
-        for cell in missing:
+        made, used = "", (0, "")
+        for cell in cells(arguments):
+            if results.find(cell) is not None:
+                continue
+            if cell["scan"] != made:
+                made = cell["scan"]
+                _make_scan(scan, cell)
+                truth = load_truth(scan)
             virtual = cell["method"] == VIRTUAL
             config = configuration(arguments, "adversarial" if virtual else cell["method"])
-            if cell["every"] != every:
-                every = cell["every"]
-                prepared = prepare(scan, config, Path(folder) / "work", device, every)
+            if (cell["every"], made) != used:
+                used = cell["every"], made
+                prepared = prepare(scan, config, Path(folder) / "work", device, cell["every"])
             preset = dataclasses.replace(resolve_preset(config, device), perturbation=PERTURBATION if virtual else 0.0)
             given = dataclasses.replace(prepared, config=config, preset=preset)
             watch = Stopwatch()
@@ -90,23 +100,38 @@ def fill(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
             results.add(cell, scores | {"used_views": float(given.maps[1].count)}, seconds)
 
 
+def _make_scan(folder: Path, cell: dict[str, Any]) -> None:
+    if cell["scan"] == "geometry":
+        study = {"errors": "geometry", "level": MIDDLE_LEVEL, "model": cell["seed"], "turn": 0.0}
+        make_scan(folder, study | {"size": cell["size"], "views": cell["views"]})
+        return
+    width, height = parsed_size(cell["size"])
+    synthesize(folder, views=cell["views"], width=width, height=height, seed=cell["seed"])
+
+
 def report(arguments: argparse.Namespace, results: Results) -> None:
-    """sparsity.md and sparsity.png: scores over the number of views."""
-    found = [cell for wanted in cells(arguments) if (cell := results.find(wanted)) is not None]
-    rows, curves = [], dict[str, dict[str, tuple[list[float], list[float]]]]()
-    for method in arguments.methods:
-        mine = [cell for cell in found if cell["settings"]["method"] == method]
-        all_views = [cell["scores"]["lpips"] for cell in mine if cell["settings"]["every"] == 1]
-        for cell in mine:
-            share = cell["scores"]["lpips"] / all_views[0] if all_views else "-"
-            rows.append([method, int(cell["scores"]["used_views"]), *(mean_of([cell], name) for name in SCORES), share])
-        for name in SCORES:
-            views = [cell["scores"]["used_views"] for cell in mine]
-            curves.setdefault(name, {})[method] = (views, [cell["scores"][name] for cell in mine])
-    table = markdown_table(["method", "views", *SCORES.values(), "share"], rows)
-    write_report(arguments.results / "sparsity.md", "Sparse views", found, table)
-    panels = [Panel(SCORES[name], "views", curves[name]) for name in ("lpips", "s3_difference", "gradient_ratio")]
-    plot_grid(arguments.results / "sparsity.png", [panels])
+    """sparsity.md and sparsity.png: scores over the number of views, for each scan."""
+    wanted = [found for cell in cells(arguments) if (found := results.find(cell)) is not None]
+    body, panels = "", []
+    for scan in arguments.scans:
+        rows, curves = [], dict[str, dict[str, tuple[list[float], list[float]]]]()
+        for method in arguments.methods:
+            key = {"scan": scan, "method": method}
+            mine = [cell for cell in wanted if key.items() <= cell["settings"].items()]
+            all_views = [cell["scores"]["lpips"] for cell in mine if cell["settings"]["every"] == 1]
+            for cell in mine:
+                scores = [mean_of([cell], name) for name in SCORES]
+                share = cell["scores"]["lpips"] / all_views[0] if all_views else "-"
+                rows.append([method, int(cell["scores"]["used_views"]), *scores, share])
+            for name in SCORES:
+                views = [cell["scores"]["used_views"] for cell in mine]
+                curves.setdefault(name, {})[method] = (views, [cell["scores"][name] for cell in mine])
+        table = markdown_table(["method", "views", *SCORES.values(), "share"], rows)
+        body += f"\n## {SCANS[scan]}\n\n{table}"
+        shown = ("lpips", "s3_difference", "gradient_ratio")
+        panels.append([Panel(f"{SCORES[name]}, {scan}", "views", curves[name]) for name in shown])
+    write_report(arguments.results / "sparsity.md", "Sparse views", wanted, body)
+    plot_grid(arguments.results / "sparsity.png", panels)
 
 
 def main(line: list[str] | None = None) -> None:

@@ -44,6 +44,7 @@ from advtex_engine.refine import apply_refinement, refine_cameras
 from advtex_engine.scene import Atlas, Camera, Mesh
 from advtex_engine.synthesize import SUPERSAMPLE, TRUTH
 from advtex_engine.texture import fill_holes
+from advtex_engine.toning import tone_views
 from advtex_engine.views import build_view_maps
 
 RESULTS = Path(__file__).parent / "results"
@@ -121,7 +122,11 @@ def run_method(given: MethodInput, method: str) -> Tensor:
     """The method's texture [H,W,3] on the CPU, from the start: what an earlier method left behind is cleared."""
     given.work.clear()
     if method.startswith("adversarial") and given.preset.start == "selection":
-        given = dataclasses.replace(given, start=start_texture(given))
+        start = start_texture(given)
+        maps = {scale: dataclasses.replace(level, color=level.color.clone()) for scale, level in given.maps.items()}
+        for level in maps.values():
+            tone_views(level, start)
+        given = dataclasses.replace(given, start=start, maps=maps)
     texture, _ = METHODS[method](dataclasses.replace(given, config=dataclasses.replace(given.config, method=method)))
     return fill_holes(texture, given.maps[1].slot_map >= 0).cpu()
 

@@ -56,6 +56,7 @@ from advtex_engine.result_page import write_page
 from advtex_engine.scene import Atlas, Mesh, Scene, View
 from advtex_engine.streaming import host_allocator, keep_off
 from advtex_engine.texture import fill_holes
+from advtex_engine.toning import tone_views
 from advtex_engine.views import ViewMaps, build_view_maps
 
 BORDERS = 1.25  # texels that views touch, of those that the charts cover
@@ -122,7 +123,10 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
         given = MethodInput(scene, atlas, maps, means, preset, config, monitor, folder, live)
         given = replace(given, on_device=budget.limits.on_device)
         if preset.start == "selection" and config.method.startswith("adversarial"):
-            given = replace(given, start=_selected_start(given))
+            start = _selected_start(given)
+            given = replace(given, start=start)
+            for level in maps.values():
+                tone_views(level, start)
     stages.save()
     held = held_bytes(maps.values(), device) + sum(mean.nbytes for mean in means.values())
     held += 0 if given.start is None else given.start.nbytes
@@ -327,11 +331,8 @@ def _view_maps(
             saved = folder.load(f"view_maps_{scale}", mapped=on_host)
             if saved is not None:
                 level = ViewMaps(**{key: saved[key] for key in ViewMaps.__dataclass_fields__})
-                if not on_host:
-                    level = level.to(device)
-                elif device.type != "cpu":
-                    level = keep_off(level, device, folder.path)
-                maps[scale] = level
+                # A copy on the host as well: what is written into a mapped cache would stay in memory.
+                maps[scale] = keep_off(level, device, folder.path) if on_host else level.to(device)
                 continue
             small = replace(atlas, width=atlas.width // scale, height=atlas.height // scale)
             maps[scale] = build_view_maps(

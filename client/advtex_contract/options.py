@@ -22,7 +22,7 @@ PRESET_HELP: dict[Preset, str] = {
     Preset.auto: "full on a GPU, standard on a CPU",
     Preset.paper: "the paper as printed: zero start, 50,000 steps",
     Preset.full: "starts from the best photograph per face, 50,000 steps; for GPUs",
-    Preset.standard: "starts from the best photograph per face, 4,000 steps; minutes on a CPU",
+    Preset.standard: "starts from the best photograph per face, 1,500 steps; minutes on a CPU",
     Preset.preview: "starts from the best photograph per face, coarse to fine; about two minutes on a CPU",
 }
 
@@ -31,7 +31,7 @@ PRESET_COST: dict[Preset, str] = {
     Preset.auto: "as full on a GPU, as standard on a CPU",
     Preset.paper: "about 2 hours for views of 320x240 on 2 CPU cores, 8 hours for 640x480; much less on a GPU",
     Preset.full: "about 2 hours for views of 320x240 on 2 CPU cores, 8 hours for 640x480; much less on a GPU",
-    Preset.standard: "about 7 minutes for views of 320x240 on 2 CPU cores, 13 minutes for 640x480",
+    Preset.standard: "about 3 minutes for views of 320x240 on 2 CPU cores, 5 minutes for 640x480",
     Preset.preview: "about 2 minutes for views of 320x240 on 2 CPU cores, 4 minutes for 640x480",
 }
 

@@ -77,9 +77,9 @@ class Preset:
 # From a sharp start the paper's weights blur: the L1 term only holds on to the start, features are matched, and the
 # discriminator has been trained before the texture listens to it.
 STANDARD = Preset(
-    levels=(PyramidLevel(4_000),),
+    levels=(PyramidLevel(1_500),),
     start="selection",
-    pretraining=400,
+    pretraining=150,
     lr_texture=2e-4,
     lr_discriminator=1e-4,
     lr_end=0.05,
@@ -98,8 +98,8 @@ PRESETS: dict[str, Preset] = {
         levels=(PyramidLevel(50_000),),
         # The same way in smaller steps: a discriminator that has gone further than standard's spoils the texture.
         pretraining=5_000,
-        lr_texture=2e-5,
-        lr_discriminator=1e-5,
+        lr_texture=8e-6,
+        lr_discriminator=4e-6,
         averaging=12_000,
         max_crop=None,
     ),

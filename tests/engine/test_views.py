@@ -124,6 +124,34 @@ def test_reprojection_finds_the_pixel_that_shows_the_same_point_and_knows_what_i
     assert visible[inside & ~near_card_edge & (maps.depth[0] > 0)].float().mean() > 0.9
 
 
+def test_reprojection_keeps_the_finest_detail() -> None:
+    """Stripes of five pixels, looked at between pixels: bilinear colors would lose a fifth of their contrast."""
+    cameras = [camera_at(0.0), camera_at(0.5 / FOCAL * 2)]
+    maps = maps_of(cameras)
+    stripes = 128 + 100 * torch.sin(torch.arange(WIDTH) * (2 * torch.pi / 5))
+    maps.color[1] = stripes.round().to(torch.uint8).expand(HEIGHT, -1).reshape(-1, 1)
+    xy, points = pixel_points(maps, 0)
+    relative = (cameras[1].world_to_camera @ torch.linalg.inv(cameras[0].world_to_camera))[:3].float()
+    color, visible = reproject(points, relative, maps, torch.tensor(1), 0.03)
+    inner = ((xy > 3) & (xy < torch.tensor([WIDTH - 3, HEIGHT - 3]))).all(1)
+    wall = visible & inner & (maps.depth[0] > 1.9) & ((xy[:, 0] - WIDTH / 2).abs() > 20)
+    assert wall.sum() > 400
+    expected = 128 + 100 * torch.sin((xy[:, 0] - 1) * (2 * torch.pi / 5))
+    assert (color[wall, 0] - expected[wall]).abs().max() < 4
+
+
+def test_reprojection_mixes_in_no_background_and_nothing_from_beyond_the_image() -> None:
+    cameras = [camera_at(0.0), camera_at(0.5 / FOCAL * 2)]
+    mask = torch.rand(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0)) < 0.9
+    maps = maps_of(cameras, mask=mask)
+    maps.color[1] = torch.where(mask, 100, 255).to(torch.uint8).view(-1, 1)
+    _, points = pixel_points(maps, 0)
+    relative = (cameras[1].world_to_camera @ torch.linalg.inv(cameras[0].world_to_camera))[:3].float()
+    color, visible = reproject(points, relative, maps, torch.tensor(1), 0.03)
+    assert visible.sum() > 1000
+    torch.testing.assert_close(color[visible], torch.full_like(color[visible], 100.0), atol=2.0, rtol=0)
+
+
 def test_a_view_sees_all_of_itself() -> None:
     maps = maps_of([camera_at(0.0)])
     _, points = pixel_points(maps, 0)

@@ -20,6 +20,7 @@ IMAGE = 3 * FLOAT  # of a pixel
 FOOTPRINT = 4 * 8  # of a pixel: four slots int32 and four weights
 SAMPLE_FLOPS = 40  # a bilinear footprint and three channels through it
 REPROJECT_FLOPS = 110  # unproject, move, project, compare four depths, sample
+BICUBIC_FLOPS = 140  # the weights of 16 pixels, and three channels through them
 VERTEX_FLOPS, FACE_FLOPS, PIXEL_FLOPS = 28, 110, 50  # of rasterization, per camera
 STRIDE = 8  # of the pixels that overlaps are estimated on
 PLACES = 3  # that view selection looks at, per face: half a corner, 1.5 midpoints, one centroid
@@ -75,7 +76,7 @@ def step_parts(width: int, height: int, slots: int, activation: int) -> dict[str
     back = through + activation * sum(sizes[1:])  # gradients in and out, and the outputs, whose signs leaky ReLU needs
     weights = PARAMETERS * activation
     return {
-        "draw and reproject": Work(REPROJECT_FLOPS * pixels, drawn),
+        "draw and reproject": Work((REPROJECT_FLOPS + BICUBIC_FLOPS) * pixels, drawn),
         "render and forward": Work(2 * sum(layers) + SAMPLE_FLOPS * pixels, rendered + 2 * through + weights),
         "texture backward": Work(sum(layers) + SAMPLE_FLOPS * pixels, back + weights + scattered),
         "discriminator backward and update": Work(

@@ -38,6 +38,16 @@ def corner(x, y, WIDTH: tl.constexpr, HEIGHT: tl.constexpr):
 
 
 @triton.jit
+def cubic(t, TAP: tl.constexpr):
+    """Weight of pixel TAP (0 to 3) of a row of four, at t in [0, 1] between the middle two (Keys 1981, a = -0.75)."""
+    apart = tl.abs(t + 1 - TAP)
+    if TAP % 3 == 0:
+        return ((-0.75 * apart + 3.75) * apart - 6.0) * apart + 3.0
+    else:
+        return (1.25 * apart - 2.25) * apart * apart + 1.0
+
+
+@triton.jit
 def choose(
     random,
     source_count,
@@ -113,22 +123,35 @@ def draw(
     around = auxiliary * (WIDTH * HEIGHT) + first
     nearest = tl.full((BLOCK,), float("inf"), tl.float32)
     covered = tl.zeros((BLOCK,), tl.float32)
-    red, green, blue = covered, covered, covered
     for tap in tl.static_range(4):
-        there = around + (tap // 2) * WIDTH + tap % 2
         weight = (right if tap % 2 else 1 - right) * (down if tap // 2 else 1 - down)
-        found = tl.load(depth + there, mask=live, other=0.0).to(tl.float32)
+        found = tl.load(depth + around + (tap // 2) * WIDTH + tap % 2, mask=live, other=0.0).to(tl.float32)
         nearest = tl.where(found > 0, tl.minimum(nearest, tl.abs(found - z_b)), nearest)
         covered += tl.where(found > 0, weight, 0.0)
-        red += weight * tl.load(color + there * 3, mask=live, other=0).to(tl.float32)
-        green += weight * tl.load(color + there * 3 + 1, mask=live, other=0).to(tl.float32)
-        blue += weight * tl.load(color + there * 3 + 2, mask=live, other=0).to(tl.float32)
+    column, row = first % WIDTH, first // WIDTH
+    whole = live & (column > 0) & (column < WIDTH - 2) & (row > 0) & (row < HEIGHT - 2)
+    for tap in tl.static_range(16):
+        found = tl.load(depth + around + (tap // 4 - 1) * WIDTH + tap % 4 - 1, mask=whole, other=0.0).to(tl.float32)
+        whole = whole & (found > 0)
+    red = tl.zeros((BLOCK,), tl.float32)
+    green, blue = red, red
+    for tap in tl.static_range(16):
+        there = around + (tap // 4 - 1) * WIDTH + tap % 4 - 1
+        weight = tl.where(whole, cubic(right, tap % 4) * cubic(down, tap // 4), 0.0)
+        wanted = whole
+        if tap == 5 or tap == 6 or tap == 9 or tap == 10:  # the four of the bilinear footprint
+            beside = (right if tap % 4 == 2 else 1 - right) * (down if tap // 4 == 2 else 1 - down)
+            weight = tl.where(whole, weight, beside)
+            wanted = live
+        red += weight * tl.load(color + there * 3, mask=wanted, other=0).to(tl.float32)
+        green += weight * tl.load(color + there * 3 + 1, mask=wanted, other=0).to(tl.float32)
+        blue += weight * tl.load(color + there * 3 + 2, mask=wanted, other=0).to(tl.float32)
     seen = (seen & (covered > MIN_FOREGROUND_WEIGHT) & (nearest < tolerance)).to(tl.float32)
     tl.store(foreground + pixel, (distance > 0).to(tl.float32), mask=live)
     tl.store(visible + pixel, seen, mask=live)
-    tl.store(real + pixel * 3, red / 127.5 - 1, mask=live)
-    tl.store(real + pixel * 3 + 1, green / 127.5 - 1, mask=live)
-    tl.store(real + pixel * 3 + 2, blue / 127.5 - 1, mask=live)
+    tl.store(real + pixel * 3, clamp(red, 255.0) / 127.5 - 1, mask=live)
+    tl.store(real + pixel * 3 + 1, clamp(green, 255.0) / 127.5 - 1, mask=live)
+    tl.store(real + pixel * 3 + 2, clamp(blue, 255.0) / 127.5 - 1, mask=live)
     for channel in tl.static_range(3):
         value = tl.load(color + flat * 3 + channel, mask=live, other=0).to(tl.float32)
         tl.store(condition + pixel * 3 + channel, value / 127.5 - 1, mask=live)

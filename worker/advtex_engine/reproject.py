@@ -79,13 +79,26 @@ def reproject(
     """The auxiliary image warped into the source view: colors [P,3] in [0,255] and visibility [P] bool.
 
     points: [P,3] metres in the source camera. relative: [3,4] source camera to auxiliary camera. auxiliary: 0-dim view
-    index. tolerance: theta_z, metres. Colors are bilinear; where invisible they mean nothing.
+    index. tolerance: theta_z, metres. Colors are bicubic, since bilinear ones would teach their blur to the texture;
+    bilinear where that would mix in background or reach beyond the image. Where invisible they mean nothing.
     """
+    width, height = maps.width, maps.height
     position, z = _project(points, relative, maps.intrinsics.index_select(0, auxiliary.view(1))[0])
     depth = _depth_of(maps, auxiliary)
-    visible, indices, weights = _visible(position, z, depth, (maps.width, maps.height), tolerance)
+    visible, indices, weights = _visible(position, z, depth, (width, height), tolerance)
     image = maps.color.index_select(0, auxiliary.view(1))[0].to(torch.float32)
-    return F.embedding_bag(indices, image, per_sample_weights=weights, mode="sum"), visible
+    bilinear = F.embedding_bag(indices, image, per_sample_weights=weights, mode="sum")
+    planes = image.view(1, height, width, 3).permute(0, 3, 1, 2).contiguous()
+    grid = (position * (2 / position.new_tensor([width, height])) - 1)[None, None]
+    sampled = F.grid_sample(planes, grid, mode="bicubic", padding_mode="border", align_corners=False)
+    whole = _whole_footprints(depth.view(height, width)).view(-1)[indices[:, 0]]
+    return torch.where(whole[:, None], sampled[0, :, 0].T.clamp(0, 255), bilinear), visible
+
+
+def _whole_footprints(depth: Tensor) -> Tensor:
+    """[H,W] bool: whether all 16 pixels of the bicubic footprint are foreground whose bilinear one starts here."""
+    background = F.pad((depth <= 0).to(torch.float32)[None], (1, 2, 1, 2), value=1.0)
+    return F.max_pool2d(F.max_pool2d(background, (1, 4), 1), (4, 1), 1)[0] == 0
 
 
 def _depth_of(maps: ViewMaps, view: Tensor) -> Tensor:

@@ -61,7 +61,7 @@ def label_faces(maps: ViewMaps, atlas: Atlas, texels: TexelMap, score: Score) ->
 
 
 def paint(given: MethodInput, texels: TexelMap, labels: Tensor) -> Tensor:
-    """Each texel's color from its face's view, bilinear -> [H,W,3] in [0,1]; the mean where that view does not see it.
+    """Each texel's color from its face's view, bicubic -> [H,W,3] in [0,1]; the mean where that view does not see it.
 
     labels: [T] int64 view of each face, -1 = none.
     """

@@ -32,7 +32,7 @@ from harness import (
     parsed_size,
     prepare,
     score_texture,
-    start_texture,
+    started,
     write_report,
 )
 from torch import Tensor, nn
@@ -110,8 +110,10 @@ def cells(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 def optimize(given: MethodInput, seed: int, patch: int = 70, **ablation: bool) -> Tensor:
     """The texture [H,W,3] on the CPU after the preset's steps from its start."""
+    given = started(given)
     maps, kind = given.maps[1], given.scene.kind
     preset = dataclasses.replace(given.preset, **ablation)  # type: ignore[arg-type]  # flags of the ablations
+    assert given.start is not None
     pairs = own_pairs(maps)
     if preset.auxiliary:
         pairs = related_pairs(maps, kind, preset.max_pair_angle, preset.min_pair_overlap)
@@ -119,7 +121,7 @@ def optimize(given: MethodInput, seed: int, patch: int = 70, **ablation: bool) -
     optimizer = AdversarialOptimizer(
         maps,
         pairs,
-        start_texture(given)[maps.slot_map >= 0],
+        given.start[maps.slot_map >= 0],
         preset,
         kind=kind,
         steps=preset.steps,

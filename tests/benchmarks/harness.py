@@ -121,21 +121,22 @@ def moved(mesh: Mesh, device: torch.device) -> Mesh:
 def run_method(given: MethodInput, method: str) -> Tensor:
     """The method's texture [H,W,3] on the CPU, from the start: what an earlier method left behind is cleared."""
     given.work.clear()
-    if method.startswith("adversarial") and given.preset.start == "selection":
-        start = start_texture(given)
-        maps = {scale: dataclasses.replace(level, color=level.color.clone()) for scale, level in given.maps.items()}
-        for level in maps.values():
-            tone_views(level, start)
-        given = dataclasses.replace(given, start=start, maps=maps)
+    if method.startswith("adversarial"):
+        given = started(given)
     texture, _ = METHODS[method](dataclasses.replace(given, config=dataclasses.replace(given.config, method=method)))
     return fill_holes(texture, given.maps[1].slot_map >= 0).cpu()
 
 
-def start_texture(given: MethodInput) -> Tensor:
-    """What the preset has the adversarial methods start from, [H,W,3] in [0,1]."""
-    if given.preset.start == "selection":
-        return select_views(given).texture
-    return torch.zeros_like(given.means[1]) if given.preset.start == "zero" else given.means[1]
+def started(given: MethodInput) -> MethodInput:
+    """With the start [H,W,3] in [0,1] that the preset has, and views in its tones if that is view selection's."""
+    if given.preset.start != "selection":
+        start = torch.zeros_like(given.means[1]) if given.preset.start == "zero" else given.means[1]
+        return dataclasses.replace(given, start=start)
+    start = select_views(given).texture
+    maps = {scale: dataclasses.replace(level, color=level.color.clone()) for scale, level in given.maps.items()}
+    for level in maps.values():
+        tone_views(level, start)
+    return dataclasses.replace(given, start=start, maps=maps)
 
 
 def needed_lpips(folder: Path | None) -> Lpips:

@@ -89,8 +89,9 @@ def reproject(
     image = maps.color.index_select(0, auxiliary.view(1))[0].to(torch.float32)
     bilinear = F.embedding_bag(indices, image, per_sample_weights=weights, mode="sum")
     planes = image.view(1, height, width, 3).permute(0, 3, 1, 2).contiguous()
-    grid = (position * (2 / position.new_tensor([width, height])) - 1)[None, None]
-    sampled = F.grid_sample(planes, grid, mode="bicubic", padding_mode="border", align_corners=False)
+    x, y = position.unbind(1)
+    grid = torch.stack((x * (2 / width) - 1, y * (2 / height) - 1), 1)
+    sampled = F.grid_sample(planes, grid[None, None], mode="bicubic", padding_mode="border", align_corners=False)
     whole = _whole_footprints(depth.view(height, width)).view(-1)[indices[:, 0]]
     return torch.where(whole[:, None], sampled[0, :, 0].T.clamp(0, 255), bilinear), visible
 

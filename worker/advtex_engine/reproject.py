@@ -98,8 +98,10 @@ def reproject(
 
 def _whole_footprints(depth: Tensor) -> Tensor:
     """[H,W] bool: whether all 16 pixels of the bicubic footprint are foreground whose bilinear one starts here."""
-    background = F.pad((depth <= 0).to(torch.float32)[None], (1, 2, 1, 2), value=1.0)
-    return F.max_pool2d(F.max_pool2d(background, (1, 4), 1), (4, 1), 1)[0] == 0
+    height, width = depth.shape
+    whole = F.pad(depth > 0, (1, 2, 1, 2))
+    whole = whole[:, :width] & whole[:, 1 : width + 1] & whole[:, 2 : width + 2] & whole[:, 3:]
+    return whole[:height] & whole[1 : height + 1] & whole[2 : height + 2] & whole[3:]
 
 
 def _depth_of(maps: ViewMaps, view: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from matplotlib.figure import Figure
@@ -39,15 +40,16 @@ from advtex_engine.models import load_model
 from advtex_engine.monitor import Monitor
 from advtex_engine.perceptual import Lpips, WeightsError, load_lpips
 from advtex_engine.pipeline import resolve_preset
-from advtex_engine.previews import render_layers
+from advtex_engine.previews import contact_sheet, render_layers, render_view
 from advtex_engine.refine import apply_refinement, refine_cameras
-from advtex_engine.scene import Atlas, Camera, Mesh
+from advtex_engine.scene import Atlas, Camera, Mesh, View
 from advtex_engine.synthesize import SUPERSAMPLE, TRUTH
 from advtex_engine.texture import fill_holes
 from advtex_engine.toning import tone_views
 from advtex_engine.views import build_view_maps
 
 RESULTS = Path(__file__).parent / "results"
+SHOWN_VIEW = 4  # of the held-out ones
 SCORES = {
     "lpips": "LPIPS",
     "nearest_patch": "nearest patch",
@@ -221,6 +223,18 @@ def mean_of(cells: Sequence[Mapping[str, Any]], name: str) -> float:
 def shown_mean(cells: Sequence[Mapping[str, Any]], name: str) -> float | str:
     """The same for a table: a dash where a cell lacks the score."""
     return mean_of(cells, name) if all(name in cell["scores"] for cell in cells) else "-"
+
+
+def picture(atlas: Atlas, texture: Tensor, truth: Truth) -> Tensor:
+    """The texture [H,W,3] from the held-out place that is shown, [h,w,3] in [0,1]."""
+    return render_view(atlas, texture, truth.cameras[SHOWN_VIEW])
+
+
+def draw(path: Path, scan: Path, truth: Truth, pictures: Mapping[str, Tensor]) -> None:
+    """The photograph from the held-out place that is shown, beside the named `picture`s from there."""
+    file = sorted((scan / "truth" / "heldout").iterdir())[SHOWN_VIEW]
+    photograph = View("held out", truth.cameras[SHOWN_VIEW], torch.from_numpy(cv2.imread(str(file))[..., ::-1].copy()))
+    contact_sheet([photograph], [list(pictures.values())], tuple(pictures), path)
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

@@ -17,20 +17,20 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import torch
 from harness import (
     SCAN_SCORES,
     SCORES,
     Results,
     Stopwatch,
-    Truth,
     common_arguments,
     configuration,
+    draw,
     load_truth,
     markdown_table,
     needed_lpips,
     parsed_size,
+    picture,
     prepare,
     run_method,
     score_model,
@@ -44,8 +44,6 @@ from advtex_engine.config import TextureConfig
 from advtex_engine.methods import MethodInput
 from advtex_engine.perceptual import Lpips
 from advtex_engine.pipeline import choose_device, resolve_preset
-from advtex_engine.previews import contact_sheet, render_view
-from advtex_engine.scene import View
 from advtex_engine.synthesize import synthesize
 
 
@@ -69,7 +67,6 @@ VARIANTS = {
     "without feature matching": Variant(changes={"feature_weight": 0.0}),
 }
 SHOWN = ("mean", "view selection", "the whole")
-SHOWN_VIEW = 4  # of the held-out ones
 HOLDOUT, SCAN_FACES = 8, 80_000  # of scans of one's own
 
 
@@ -108,11 +105,11 @@ def fill(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
             config = configuration(arguments, "adversarial")
             shown: dict[str, Tensor] = {}
             for name, given, texture, seconds in textures(missing, scan, config, work, device):
-                shown[name] = render_view(given.atlas, texture, truth.cameras[SHOWN_VIEW])
+                shown[name] = picture(given.atlas, texture, truth)
                 scores = score_texture(given.atlas, texture, truth, lpips)
                 results.add(settings_of(arguments, model, name), scores, seconds)
             if set(SHOWN) <= shown.keys():
-                draw(arguments.results / f"object_{model}.png", scan, truth, [shown[name] for name in SHOWN])
+                draw(arguments.results / f"object_{model}.png", scan, truth, {name: shown[name] for name in SHOWN})
 
 
 def fill_scans(arguments: argparse.Namespace, results: Results) -> None:
@@ -150,13 +147,6 @@ def textures(
         watch = Stopwatch()
         texture = run_method(given, variant.method)
         yield name, given, texture, watch.seconds
-
-
-def draw(path: Path, scan: Path, truth: Truth, pictures: list[Tensor]) -> None:
-    """A photograph from a held-out place beside what the shown variants give there."""
-    file = sorted((scan / "truth" / "heldout").iterdir())[SHOWN_VIEW]
-    photograph = View("held out", truth.cameras[SHOWN_VIEW], torch.from_numpy(cv2.imread(str(file))[..., ::-1].copy()))
-    contact_sheet([photograph], [pictures], SHOWN, path)
 
 
 def report(arguments: argparse.Namespace, results: Results) -> None:

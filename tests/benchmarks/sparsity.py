@@ -6,8 +6,9 @@ Of two scans: `default`, as `advtex-engine synthesize` makes it, and `geometry`,
 at its middle level. `adversarial_virtual` adds the virtual cameras that the paper's supplement D proposes for sparse
 views: each auxiliary camera is moved at random, by up to PERTURBATION of the view's width in its image.
 
-Writes sparsity.json, sparsity.md and sparsity.png below --results; goes on with missing cells when run again. In the
-table, `share` is the LPIPS over that of the same method with all views.
+Writes sparsity.json, sparsity.md, sparsity.png and, for the views of each scan whose cells were all run at once, a
+picture below --results; goes on with missing cells when run again. In the table, `share` is the LPIPS over that of the
+same method with all views.
 """
 
 from __future__ import annotations
@@ -26,11 +27,13 @@ from harness import (
     Stopwatch,
     common_arguments,
     configuration,
+    draw,
     load_truth,
     markdown_table,
     mean_of,
     needed_lpips,
     parsed_size,
+    picture,
     plot_grid,
     prepare,
     run_method,
@@ -38,6 +41,7 @@ from harness import (
     write_report,
 )
 from study import make_scan
+from torch import Tensor
 
 from advtex_engine.config import METHODS
 from advtex_engine.perceptual import Lpips
@@ -89,7 +93,7 @@ def fill(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
             virtual = cell["method"] == VIRTUAL
             config = configuration(arguments, "adversarial" if virtual else cell["method"])
             if (cell["every"], made) != used:
-                used = cell["every"], made
+                used, shown = (cell["every"], made), dict[str, Tensor]()
                 prepared = prepare(scan, config, Path(folder) / "work", device, cell["every"])
             preset = dataclasses.replace(resolve_preset(config, device), perturbation=PERTURBATION if virtual else 0.0)
             given = dataclasses.replace(prepared, config=config, preset=preset)
@@ -97,6 +101,9 @@ def fill(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
             texture = run_method(given, config.method)
             seconds = watch.seconds
             scores = score_texture(given.atlas, texture, truth, lpips)
+            shown[cell["method"]] = picture(given.atlas, texture, truth)
+            if set(arguments.methods) <= shown.keys():
+                draw(arguments.results / f"{made}_{given.maps[1].count}_views.png", scan, truth, shown)
             results.add(cell, scores | {"used_views": float(given.maps[1].count)}, seconds)
 
 

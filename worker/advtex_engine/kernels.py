@@ -70,6 +70,33 @@ def choose(
 
 
 @triton.jit
+def warped(color, depth, around, first, right, down, live, WIDTH: tl.constexpr, HEIGHT: tl.constexpr):
+    """Bicubic color of a view at `corner`'s result, bilinear where one of the 16 pixels is background or missing.
+
+    around: `first` among the pixels of all views.
+    """
+    column, row = first % WIDTH, first // WIDTH
+    whole = live & (column > 0) & (column < WIDTH - 2) & (row > 0) & (row < HEIGHT - 2)
+    for tap in tl.static_range(16):
+        found = tl.load(depth + around + (tap // 4 - 1) * WIDTH + tap % 4 - 1, mask=whole, other=0.0).to(tl.float32)
+        whole = whole & (found > 0)
+    red = tl.zeros_like(right)
+    green, blue = red, red
+    for tap in tl.static_range(16):
+        there = around + (tap // 4 - 1) * WIDTH + tap % 4 - 1
+        weight = tl.where(whole, cubic(right, tap % 4) * cubic(down, tap // 4), 0.0)
+        wanted = whole
+        if tap == 5 or tap == 6 or tap == 9 or tap == 10:  # the four of the bilinear footprint
+            beside = (right if tap % 4 == 2 else 1 - right) * (down if tap // 4 == 2 else 1 - down)
+            weight = tl.where(whole, weight, beside)
+            wanted = live
+        red += weight * tl.load(color + there * 3, mask=wanted, other=0).to(tl.float32)
+        green += weight * tl.load(color + there * 3 + 1, mask=wanted, other=0).to(tl.float32)
+        blue += weight * tl.load(color + there * 3 + 2, mask=wanted, other=0).to(tl.float32)
+    return clamp(red, 255.0), clamp(green, 255.0), clamp(blue, 255.0)
+
+
+@triton.jit
 def draw(
     chosen,
     relative,
@@ -128,30 +155,13 @@ def draw(
         found = tl.load(depth + around + (tap // 2) * WIDTH + tap % 2, mask=live, other=0.0).to(tl.float32)
         nearest = tl.where(found > 0, tl.minimum(nearest, tl.abs(found - z_b)), nearest)
         covered += tl.where(found > 0, weight, 0.0)
-    column, row = first % WIDTH, first // WIDTH
-    whole = live & (column > 0) & (column < WIDTH - 2) & (row > 0) & (row < HEIGHT - 2)
-    for tap in tl.static_range(16):
-        found = tl.load(depth + around + (tap // 4 - 1) * WIDTH + tap % 4 - 1, mask=whole, other=0.0).to(tl.float32)
-        whole = whole & (found > 0)
-    red = tl.zeros((BLOCK,), tl.float32)
-    green, blue = red, red
-    for tap in tl.static_range(16):
-        there = around + (tap // 4 - 1) * WIDTH + tap % 4 - 1
-        weight = tl.where(whole, cubic(right, tap % 4) * cubic(down, tap // 4), 0.0)
-        wanted = whole
-        if tap == 5 or tap == 6 or tap == 9 or tap == 10:  # the four of the bilinear footprint
-            beside = (right if tap % 4 == 2 else 1 - right) * (down if tap // 4 == 2 else 1 - down)
-            weight = tl.where(whole, weight, beside)
-            wanted = live
-        red += weight * tl.load(color + there * 3, mask=wanted, other=0).to(tl.float32)
-        green += weight * tl.load(color + there * 3 + 1, mask=wanted, other=0).to(tl.float32)
-        blue += weight * tl.load(color + there * 3 + 2, mask=wanted, other=0).to(tl.float32)
+    red, green, blue = warped(color, depth, around, first, right, down, live, WIDTH, HEIGHT)
     seen = (seen & (covered > MIN_FOREGROUND_WEIGHT) & (nearest < tolerance)).to(tl.float32)
     tl.store(foreground + pixel, (distance > 0).to(tl.float32), mask=live)
     tl.store(visible + pixel, seen, mask=live)
-    tl.store(real + pixel * 3, clamp(red, 255.0) / 127.5 - 1, mask=live)
-    tl.store(real + pixel * 3 + 1, clamp(green, 255.0) / 127.5 - 1, mask=live)
-    tl.store(real + pixel * 3 + 2, clamp(blue, 255.0) / 127.5 - 1, mask=live)
+    tl.store(real + pixel * 3, red / 127.5 - 1, mask=live)
+    tl.store(real + pixel * 3 + 1, green / 127.5 - 1, mask=live)
+    tl.store(real + pixel * 3 + 2, blue / 127.5 - 1, mask=live)
     for channel in tl.static_range(3):
         value = tl.load(color + flat * 3 + channel, mask=live, other=0).to(tl.float32)
         tl.store(condition + pixel * 3 + channel, value / 127.5 - 1, mask=live)

@@ -5,6 +5,7 @@ p_A = d_A K_A^-1 P_A;  p_B = T_B^-1 T_A p_A;  P_B = K_B p_B.  Everything here is
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import torch
@@ -91,9 +92,12 @@ def reproject(
     planes = image.view(1, height, width, 3).permute(0, 3, 1, 2).contiguous()
     x, y = position.unbind(1)
     grid = torch.stack((x * (2 / width) - 1, y * (2 / height) - 1), 1)
-    sampled = F.grid_sample(planes, grid[None, None], mode="bicubic", padding_mode="border", align_corners=False)
+    parts = math.gcd(len(grid), torch.get_num_threads())  # on a CPU one image has one thread
+    planes, grid = planes.expand(parts, -1, -1, -1), grid.view(parts, 1, -1, 2)
+    sampled = F.grid_sample(planes, grid, mode="bicubic", padding_mode="border", align_corners=False)
+    bicubic = sampled[:, :, 0].transpose(1, 2).reshape(-1, 3).clamp(0, 255)
     whole = _whole_footprints(depth.view(height, width)).view(-1)[indices[:, 0]]
-    return torch.where(whole[:, None], sampled[0, :, 0].T.clamp(0, 255), bilinear), visible
+    return torch.where(whole[:, None], bicubic, bilinear), visible
 
 
 def _whole_footprints(depth: Tensor) -> Tensor:

@@ -92,6 +92,7 @@ class Dispatcher:
             queue.withdraw({found.gib for found in classes})
             waiting = {found.gib: len(queue.waiting_ids(found.gib)) for found in classes}
             before = sum(waiting.values())
+            self._take_back(classes, waiting)
             for found in classes:
                 waiting[found.gib] += self._offer(found, found.idle - waiting[found.gib], sum(waiting.values()))
             for found in classes:
@@ -104,6 +105,14 @@ class Dispatcher:
             raise
         self._explain(classes)
         return sum(waiting.values()) - before
+
+    def _take_back(self, classes: Sequence[WorkerClass], waiting: dict[int, int]) -> None:
+        """What waits behind busy workers while larger ones are idle, which are offered it next."""
+        for place, found in enumerate(classes):
+            free = sum(max(0, larger.idle - waiting[larger.gib]) for larger in classes[place + 1 :])
+            behind = min(waiting[found.gib] - found.idle, free)
+            if behind > 0:
+                waiting[found.gib] -= self.store.queue.take_back(found.gib, behind)
 
     def _offer(self, to: WorkerClass, room: int, in_redis: int) -> int:
         """The next attempts to one class, as far as there is room. -> how many were new."""

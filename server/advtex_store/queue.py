@@ -135,11 +135,20 @@ class JobQueue:
             name = _text(raw).removeprefix(Queue.redis_queue_namespace_prefix)
             if not name.startswith(QUEUE) or name in kept:
                 continue
-            key = _key(name)
-            for rq_id in map(_text, self.redis.lrange(key, 0, -1)):
-                if self.redis.lrem(key, 1, rq_id):  # else a worker has just come and taken it
-                    with suppress(NoSuchJobError):
-                        self._fetch(rq_id).delete()
+            self._remove(name, 0)
+
+    def take_back(self, gib: int, count: int) -> int:
+        """Of what waits for a class, the last `count`. -> how many: a worker may have just come and taken some."""
+        return self._remove(queue_name(gib), -count)
+
+    def _remove(self, name: str, first: int) -> int:
+        removed, key = 0, _key(name)
+        for rq_id in map(_text, self.redis.lrange(key, first, -1)):
+            if self.redis.lrem(key, 1, rq_id):  # else a worker has just come and taken it
+                removed += 1
+                with suppress(NoSuchJobError):
+                    self._fetch(rq_id).delete()
+        return removed
 
     def waiting_ids(self, gib: int) -> list[str]:
         """`job-attempt` of all that waits for a class, first to last."""

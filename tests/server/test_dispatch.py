@@ -132,6 +132,22 @@ def test_no_job_waits_behind_a_busy_worker_while_another_is_idle(store: Store) -
     assert in_redis(store) == [f"{jobs[1]}-1"], "one may wait"
 
 
+def test_what_waits_behind_a_busy_worker_goes_to_a_larger_one_that_becomes_idle(store: Store) -> None:
+    only_workers(store)
+    for name, gib in (("small", 8), ("large", 24)):
+        store.queue.announce(name, gib, busy=True)
+    jobs = [submit(store, gib=2) for _ in range(2)]
+    dispatcher = Dispatcher(store, settings(store))
+    dispatcher.dispatch()
+    assert (in_redis(store, 8), in_redis(store, 24)) == ([f"{jobs[0]}-1"], [f"{jobs[1]}-1"])
+    store.queue.redis.lpop(f"rq:queue:{queue_name(24)}")
+    store.records.claim(jobs[1], 1, "large")
+    store.queue.announce("large", 24)
+    dispatcher.dispatch()
+    assert (in_redis(store, 8), in_redis(store, 24)) == ([], [f"{jobs[0]}-1"])
+    assert store.records.job(jobs[0]).attempt == 1
+
+
 def test_preempted_jobs_spread_over_all_workers(store: Store) -> None:
     only_workers(store, GIB, GIB, 2 * GIB)
     jobs = [submit(store, gib=1) for _ in range(3)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import importlib.util
 import json
 import pickle  # noqa: TID251 - the peer reads its pairs from a pickle; it is written here and read by no one else
 import random
@@ -11,7 +12,7 @@ import sys
 import time
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,27 @@ class Clock:
 
 
 made = list[Clock]()
+
+
+class Frequencies:
+    """The peer takes elements of torch.fft.fftfreq, on the host, by indices on the device: only PyTorch < 1.13 did."""
+
+    def __init__(self, values: torch.Tensor) -> None:
+        self.values = values
+
+    def __mul__(self, factor: int) -> Frequencies:
+        return Frequencies(self.values * factor)
+
+    def __getitem__(self, index: torch.Tensor) -> torch.Tensor:
+        return self.values[index.to(self.values.device)]
+
+
+def stand_in() -> None:
+    """What lets the peer's files, written for PyTorch 1.9, run as they are."""
+    if importlib.util.find_spec("torchvision") is None:
+        sys.modules["torchvision"] = ModuleType("torchvision")  # imported and not used
+    fftfreq = torch.fft.fftfreq
+    torch.fft.fftfreq = lambda count: Frequencies(fftfreq(count))
 
 
 def options(folder: Path) -> argparse.Namespace:
@@ -66,6 +88,7 @@ def main() -> None:
     joblib = importlib.import_module("joblib")
     joblib.dump(dict.fromkeys(range(len(pairs)), (0, 0)), folder / "offset_dict.p")
     (folder / "out" / "shape").mkdir(parents=True)
+    stand_in()
     peer: Any = importlib.import_module("advtex_init_align.tex_smooth.optim_patch_torch")
     chosen = options(folder)
     # As the peer's command line does before it trains.

@@ -3,17 +3,15 @@
     python tests/benchmarks/peer_step.py CHECKOUT [--size 640x480] [--views 100] [--steps 200] [--device cuda]
 
 CHECKOUT: of the code released with Zhao, Zhao, Schwing, "Initialization and Alignment for Adversarial Texture
-Optimization" (ECCV 2022); it stays where it is, outside of this repository. Its own requirements have to be installed
-where this runs: opencv-python, Pillow, tqdm, joblib, torchvision.
+Optimization" (ECCV 2022); it stays where it is, outside of this repository. What its loop needs beside this project's
+own requirements has to be installed where this runs: joblib, Pillow, tqdm. It imports torchvision and uses nothing of
+it, so an empty module stands in where there is none.
 
 The views of the bench's own scene are written as the peer reads them, and its `train` runs unchanged, loader included,
 with the options of its run.sh; only its progress bar is replaced, by one that waits for the device and looks at the
 clock. Its texture starts from the projected mean at the atlas's size. Ours takes the same views and texture through
 the step that a run takes, once with the published method's numbers and once with those of the preset full. The peer
 comes first, alone, in a process of its own; then ours.
-
-Not yet run against the real checkout: it was written against the files and names that the release has, which the
-tests' small double repeats.
 """
 
 from __future__ import annotations
@@ -67,18 +65,22 @@ def check(checkout: Path) -> None:
 def write_views(folder: Path, scene: Scene, atlas: Atlas, maps: ViewMaps, pairs: Pairs) -> None:
     """The views as the peer's dataset reads them, and the texture it starts from.
 
-    Its pixel centers are whole numbers, its v counts from the texture's lower edge.
+    Its pixel centers are whole numbers, its v counts from the texture's lower edge, and the centers of the outermost
+    texels are at 0 and 1. Its files of depth and uv are compressed, and a view is among its own pairs, as its converter
+    has them.
     """
     (folder / "raw_colors").mkdir(parents=True)
     (folder / "shape").mkdir()
     shape = (maps.height, maps.width)
+    size = np.array((atlas.width, atlas.height), np.float32)
     for index, view in enumerate(scene.views):
         color, depth = maps.color[index].view(*shape, 3), maps.depth[index].view(shape)
         uv = decode_uv(maps.uv[index]).view(*shape, 2).cpu().numpy()
         name = f"{index:05d}"
         cv2.imwrite(str(folder / "raw_colors" / f"{name}_raw_color.png"), color.cpu().numpy()[..., ::-1])
-        np.savez(folder / f"{name}_uv.npz", np.stack((uv[..., 0], 1 - uv[..., 1]), 2))
-        np.savez(folder / f"{name}_depth.npz", depth.float().cpu().numpy())
+        uv = ((uv * size - 0.5) / (size - 1)).clip(0, 1)
+        np.savez_compressed(folder / f"{name}_uv.npz", np.stack((uv[..., 0], 1 - uv[..., 1]), 2))
+        np.savez_compressed(folder / f"{name}_depth.npz", depth.float().cpu().numpy())
         cv2.imwrite(str(folder / f"{name}_mask.png"), (depth > 0).to(torch.uint8).mul(255).cpu().numpy())
         intrinsic = np.eye(4)
         intrinsic[:3, :3] = view.camera.K.numpy()
@@ -86,8 +88,8 @@ def write_views(folder: Path, scene: Scene, atlas: Atlas, maps: ViewMaps, pairs:
         np.savetxt(folder / f"{name}_intrinsic.txt", intrinsic)
         np.savetxt(folder / f"{name}_pose.txt", view.camera.world_to_camera.numpy())
     rows = zip(pairs.auxiliary.tolist(), pairs.count.tolist(), strict=True)
-    # The view itself, which comes first, is added by the peer.
-    (folder / "pairs.json").write_text(json.dumps([row[1 : max(1, count)] for row, count in rows]))
+    # The peer's converter lists the view itself, which comes first, and its dataset adds it once more.
+    (folder / "pairs.json").write_text(json.dumps([row[:count] for row, count in rows]))
     start = (mean_texture(maps).clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
     assert start.shape[:2] == (atlas.height, atlas.width)
     cv2.imwrite(str(folder / "shape" / "mtl0.png"), start[..., ::-1])

@@ -39,7 +39,7 @@ def train(args):
         bar.update()
         time.sleep(0.02)
     for index, others in enumerate(pairs):
-        assert index not in others  # the peer adds it
+        assert others.count(index) == 1  # as its converter has it; its dataset adds it once more
         color, mask, uv, depth, K, world2cam = load(root, index)
         assert color.shape == (*mask.shape, 3) and uv.shape == (*mask.shape, 2) and 0 <= uv.min() <= uv.max() <= 1
         assert ((mask > 0) == (depth > 0)).all() and 0.1 < mask.mean() < 1

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from hypothesis import strategies as st
 from advtex_engine.depth import PLAIN, ROTATED, DepthEncoding, Raw, depth_in_color_image, inflate, measure_depth
 from advtex_engine.errors import Problem
 from advtex_engine.monitor import Monitor
+from advtex_engine.rasterize import rasterize
 from advtex_engine.scene import Camera, Mesh
 
 MILLIMETRES = DepthEncoding("1000 units per metre", 1000.0)
@@ -37,6 +40,17 @@ def wall(z: float = 2.0, tilt: float = 0.3) -> Mesh:
     """A large rectangle at depth z + tilt x."""
     positions = torch.tensor([(x, y, z + tilt * x) for x, y in ((-3.0, -3), (3, -3), (3, 3), (-3, 3))])
     return Mesh(positions, torch.tensor([[0, 1, 2], [0, 2, 3]]))
+
+
+def corner() -> Mesh:
+    """Of a room: two walls and a floor that meet beyond (0, 0.6, 2.6)."""
+    a, b, c, d = (0.0, 0.6, 2.6), (-3.0, 0.6, 0.8), (3.0, 0.6, 1.2), (0.0, -4.0, 2.6)
+    positions = torch.tensor([a, b, c, d, (-3.0, -4, 0.8), (3.0, -4, 1.2), (0.0, 0.6, -3)])
+    return Mesh(positions, torch.tensor([[0, 1, 4], [0, 4, 3], [0, 3, 5], [0, 5, 2], [0, 6, 1], [0, 2, 6]]))
+
+
+def corner_depth(of: Camera) -> np.ndarray:
+    return rasterize(corner(), of).depth.numpy()
 
 
 def wall_depth(of: Camera, z: float = 2.0, tilt: float = 0.3) -> np.ndarray:
@@ -88,6 +102,33 @@ def test_depth_that_fits_nothing_is_ignored_with_a_warning() -> None:
     listener = Listener()
     samples = [(camera(), stored(wall_depth(camera()) * 1.2, MILLIMETRES))]
     assert measure_depth(wall(), samples, MILLIMETRES, listener) is None
+    assert [problem.code for problem in listener.warnings] == ["depth_ignored"]
+
+
+def turned(of: Camera, degrees: float) -> Camera:
+    """About the point at depth 2 before it."""
+    turn = torch.linalg.matrix_exp(math.radians(degrees) * torch.tensor([[0.0, -0.4, 1], [0.4, 0, -0.6], [-1, 0.6, 0]]))
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, :3] = turn
+    motion[:3, 3] = torch.tensor([0, 0, 2.0]) - turn @ torch.tensor([0, 0, 2.0])
+    return replace(of, world_to_camera=of.world_to_camera @ motion)
+
+
+@pytest.mark.parametrize(("may_move", "code"), [(True, "poses_off"), (False, "depth_ignored")])
+def test_depth_that_fits_from_other_poses_is_kept_where_poses_may_move(may_move: bool, code: str) -> None:
+    listener = Listener()
+    true = camera(160, 120, 150)
+    samples = [(turned(true, 20), stored(corner_depth(true), MILLIMETRES))]
+    found = measure_depth(corner(), samples, MILLIMETRES, listener, poses_may_move=may_move)
+    assert found is (MILLIMETRES if may_move else None)
+    assert [problem.code for problem in listener.warnings] == [code]
+
+
+def test_depth_in_a_wrong_unit_is_no_matter_of_poses() -> None:
+    listener = Listener()
+    true = camera(160, 120, 150)
+    samples = [(true, stored(corner_depth(true) * 1.08, MILLIMETRES))]
+    assert measure_depth(corner(), samples, MILLIMETRES, listener, poses_may_move=True) is None
     assert [problem.code for problem in listener.warnings] == ["depth_ignored"]
 
 

@@ -396,3 +396,23 @@ def test_a_real_kitchen_agrees_better_with_itself() -> None:
     assert report["mean"]["residual_after"] < 0.85 * report["mean"]["residual_before"]
     assert report["mean"]["color_after"] < 0.85 * report["mean"]["color_before"]
     assert report["mean"]["kept_pose"] < 0.1
+
+
+def test_grossly_wrong_poses_are_found_from_depth_before_photographs_are_compared(tmp_path: Path) -> None:
+    synthesize(tmp_path, views=12, width=160, height=120, camera_error=0.01, camera_turn=math.radians(5))
+    scene = ingest(tmp_path, TextureConfig(), Monitor())
+    refinement = refine_cameras(scene, CPU, 0)
+    assert refinement.report["mean"]["by_depth"] > 0.8
+    truth = json.loads((tmp_path / "truth" / "cameras.json").read_text())
+    true = {
+        frame["name"]: torch.linalg.inv(torch.tensor(frame["camera_to_world"]).double()) for frame in truth["frames"]
+    }
+    off = []
+    for view, pose in zip(scene.views, refinement.world_to_camera, strict=True):
+        there, _ = project(view.camera, scene.mesh.v_pos)
+        found, _ = project(replace(view.camera, world_to_camera=pose), scene.mesh.v_pos)
+        right, _ = project(replace(view.camera, world_to_camera=true[Path(view.name).stem]), scene.mesh.v_pos)
+        off.append([float((pixels - right).norm(dim=1).median()) for pixels in (there, found)])
+    before, after = torch.tensor(off).median(0).values
+    assert before > 5
+    assert after < 0.2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,8 +12,9 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from advtex_engine.cameras import project
 from advtex_engine.rasterize import rasterize
-from advtex_engine.registration import move_mesh, register_mesh
+from advtex_engine.registration import move_mesh, register_camera, register_mesh
 from advtex_engine.scene import Camera, DepthFrame, Mesh
 from advtex_engine.synthetic_object import look_at
 
@@ -136,3 +138,40 @@ def test_without_depth_the_model_stays() -> None:
     mesh, report = register_mesh(TRUE, empty)
     assert mesh is TRUE
     assert not report["accepted"]
+
+
+def misplaced(frame: DepthFrame, shift: tuple[float, float, float], degrees: float) -> DepthFrame:
+    pose = frame.camera.world_to_camera @ motion_of(shift, degrees, (0.3, 0.5, 0.8))
+    return replace(frame, camera=replace(frame.camera, world_to_camera=pose))
+
+
+def pixels_off(pose: torch.Tensor, camera: Camera) -> float:
+    """Median over the vertices."""
+    there, _ = project(replace(camera, world_to_camera=pose), TRUE.v_pos)
+    true, _ = project(camera, TRUE.v_pos)
+    return float((there - true).norm(dim=1).median())
+
+
+@pytest.mark.parametrize("frame", FRAMES[1::2])  # seen from straight ahead, boxes slide along their faces
+def test_a_grossly_wrong_camera_is_put_where_its_depth_fits(frame: DepthFrame) -> None:
+    wrong = misplaced(frame, (0.03, -0.04, 0.03), 6)
+    found = register_camera(TRUE, wrong)
+    assert found is not None
+    before = pixels_off(wrong.camera.world_to_camera, frame.camera)
+    assert before > 2.5
+    assert pixels_off(found, frame.camera) < 0.1 * before
+
+
+@pytest.mark.parametrize("degrees", [0, 0.2])
+def test_a_camera_that_is_nearly_right_stays_for_the_photographs_to_judge(degrees: float) -> None:
+    assert register_camera(TRUE, misplaced(FRAMES[0], (0, 0, 0), degrees)) is None
+
+
+def test_a_camera_stays_where_its_depth_fits_from_nowhere() -> None:
+    generator = torch.Generator().manual_seed(0)
+    frame = FRAMES[0]
+    noise = 1 + 0.08 * torch.randn(frame.depth.shape, generator=generator)
+    assert register_camera(TRUE, replace(frame, depth=frame.depth * noise)) is None
+    assert register_camera(TRUE, replace(frame, depth=torch.zeros_like(frame.depth))) is None
+    away = replace(frame.camera, world_to_camera=frame.camera.world_to_camera @ motion_of((9, 0, 0), 0, (0, 0, 1)))
+    assert register_camera(TRUE, replace(frame, camera=away)) is None

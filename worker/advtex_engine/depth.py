@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,8 @@ from advtex_engine.cameras import scaled_camera
 from advtex_engine.errors import Problem
 from advtex_engine.monitor import Monitor
 from advtex_engine.rasterize import rasterize
-from advtex_engine.scene import Camera, Mesh
+from advtex_engine.registration import register_camera
+from advtex_engine.scene import Camera, DepthFrame, Mesh
 from advtex_scan.manifest import ScanManifest
 
 Raw = npt.NDArray[np.uint16]
@@ -84,12 +85,18 @@ def inflate(data: bytes, width: int, height: int) -> Raw:
 
 
 def measure_depth(
-    mesh: Mesh, samples: Sequence[tuple[Camera, Raw]], declared: DepthEncoding, monitor: Monitor
+    mesh: Mesh,
+    samples: Sequence[tuple[Camera, Raw]],
+    declared: DepthEncoding,
+    monitor: Monitor,
+    *,
+    poses_may_move: bool = False,
 ) -> DepthEncoding | None:
     """The encoding whose depth agrees with the mesh; None, with a warning, if none does.
 
     samples: depth cameras at the stored images' size, and those images. The declared encoding is taken if it fits or
-    if too few readings meet the mesh to judge; another one brings a warning.
+    if too few readings meet the mesh to judge; another one brings a warning. poses_may_move: it is also taken if it
+    fits from other poses, which brings a warning too.
     """
     pairs = [_readings(mesh, camera, raw) for camera, raw in samples]
     stored = np.concatenate([raw for raw, _ in pairs]) if pairs else np.zeros(0, np.uint16)
@@ -111,6 +118,18 @@ def measure_depth(
             )
         )
         return best
+    moved = _agreement_elsewhere(mesh, samples, declared) if poses_may_move else 0.0
+    if moved >= FITTING_SHARE and _agreement_scaled(declared, stored, rendered) < FITTING_SHARE:
+        monitor.warning(
+            Problem(
+                "poses_off",
+                "poses",
+                f"the poses are off: {shares[declared]:.0%} of the depth readings agree with the mesh, and {moved:.0%} "
+                "do from poses that fit them",
+                "none needed; cameras are refined from there. Look into the app's tracking",
+            )
+        )
+        return declared
     monitor.warning(
         Problem(
             "depth_ignored",
@@ -127,6 +146,24 @@ def agreement(encoding: DepthEncoding, raw: Raw, rendered: npt.NDArray[np.float3
     """Share of the readings [N] within AGREEMENT of the mesh's depth [N] (metres, > 0)."""
     metres = encoding.metres(raw)
     return float((np.abs(metres - rendered) < AGREEMENT * rendered).mean())
+
+
+def _agreement_scaled(encoding: DepthEncoding, raw: Raw, rendered: npt.NDArray[np.float32]) -> float:
+    """The `agreement` of depth in the unit that fits best: wrong poses are no matter of units."""
+    metres = encoding.metres(raw)
+    ratio = rendered[metres > 0] / metres[metres > 0]
+    scale = float(np.median(ratio)) if len(ratio) else 1.0
+    return float((np.abs(scale * metres - rendered) < AGREEMENT * rendered).mean())
+
+
+def _agreement_elsewhere(mesh: Mesh, samples: Sequence[tuple[Camera, Raw]], encoding: DepthEncoding) -> float:
+    """The `agreement` from the poses at which each image fits the mesh, where there are such."""
+    pairs = []
+    for camera, raw in samples:
+        pose = register_camera(mesh, DepthFrame(camera, torch.from_numpy(encoding.metres(raw))))
+        pairs.append(_readings(mesh, camera if pose is None else replace(camera, world_to_camera=pose), raw))
+    stored, rendered = (np.concatenate(column) for column in zip(*pairs, strict=True))
+    return agreement(encoding, stored, rendered) if len(stored) >= MIN_READINGS else 0.0
 
 
 def _readings(mesh: Mesh, camera: Camera, raw: Raw) -> tuple[Raw, npt.NDArray[np.float32]]:

@@ -110,7 +110,7 @@ def _capture(
 ) -> Capture:
     entry = manifest.mesh
     mesh = None if entry is None else _placed(load_mesh(archive, entry.path), entry.mesh_to_world)
-    encoding = _depth_encoding(archive, manifest, mesh, monitor)
+    encoding = _depth_encoding(archive, manifest, mesh, config.refines, monitor)
     first = rectified(manifest.frames[0].color_intrinsics, manifest.frames[0].border)
     size = config.size or (first.width, first.height)
     every = config.holdout
@@ -261,7 +261,7 @@ def _masked(frame: DepthFrame, mask: torch.Tensor, camera: Camera) -> DepthFrame
 
 
 def _depth_encoding(
-    archive: ScanArchive, manifest: ScanManifest, mesh: Mesh | None, monitor: Monitor
+    archive: ScanArchive, manifest: ScanManifest, mesh: Mesh | None, refines: bool, monitor: Monitor
 ) -> DepthEncoding | None:
     """How the scan's depth is stored, measured on a few frames; None if there is none that can be used.
 
@@ -285,4 +285,4 @@ def _depth_encoding(
             trust = decode_confidence(levels, entry.confidence, entry.depth_intrinsics, manifest.confidence_max)
             raw = np.where(trust > 0, raw, np.uint16(0))
         samples.append((depth_camera(entry, entry.depth_intrinsics, manifest.depth_to_color), raw))
-    return measure_depth(mesh, samples, declared, monitor)
+    return measure_depth(mesh, samples, declared, monitor, poses_may_move=refines)

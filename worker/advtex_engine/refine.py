@@ -5,7 +5,10 @@ see, where the given cameras put it. Nothing is taken on trust: cells of the sur
 whether its new pose is better than the given one, which it gets back if not, and whether all of it is better than
 nothing. The same goes for the exposures.
 
-Before that, intrinsics and the color camera's place on the device are corrected if they are grossly wrong: held-out
+What is grossly wrong is put right first. Photographs that are off by tens of pixels have nothing to say to each other,
+but a depth image finds its way to the mesh (`registration`): such poses are where the rest begins.
+
+Then intrinsics and the color camera's place on the device are corrected if they are grossly wrong: held-out
 frames, which the same device has taken, get that correction too. What is off by less stays as given, since the poses
 make up for it and nothing else needs to know.
 """
@@ -26,7 +29,9 @@ from advtex_engine.refine_exposure import corrected_color, fit_exposure, sample_
 from advtex_engine.refine_points import Observations
 from advtex_engine.refine_pose import keep_gauge, look, refine_poses
 from advtex_engine.refine_sight import CONTRAST_SCALE, Sight, look_at, motion
-from advtex_engine.scene import Camera, Scene, View
+from advtex_engine.registration import register_camera
+from advtex_engine.scene import Camera, DepthFrame, Mesh, Scene, View
+from advtex_engine.threads import in_threads
 
 COLOR_SCALE = 0.1  # disagreements beyond twice that are highlights
 DEVICE_POINTS = 1250  # per view
@@ -66,22 +71,26 @@ def refine_cameras(scene: Scene, device: torch.device, seed: int) -> Refinement:
     Held-out views are not read. On a CPU the same input and seed give the same result. Views that share too little with
     others keep their pose.
     """
+    came = scene
+    scene, by_depth = _registered(scene, device)
     sight = look_at(scene.mesh, scene.views, scene.kind, device, seed)
     if sight is None:
-        return _unmoved(scene)
+        return _unmoved(came)
+    given = torch.stack([view.camera.world_to_camera for view in came.views]).to(sight.given)
     camera = scene.views[0].camera
     scale = (camera.width / sight.size[0], camera.height / sight.size[1])
     common, described = _device(sight)
     if common is not None:
         common = common.at_scale(*scale)
         scene = replace(scene, views=tuple(_on_device(view, common) for view in scene.views))
+        given = common.offset.to(given) @ given
         sight = look_at(scene.mesh, scene.views, scene.kind, device, seed)
         if sight is None:
-            return _unmoved(scene)
-    found, poses = _poses(sight)
+            return _unmoved(came)
+    found, poses = _poses(sight, given)
     gain, offset, exposures = _exposures(sight, found)
-    moved = motion(found, sight) * torch.tensor([1.0, 1.0, scale[0]])
-    columns = {**poses, **exposures, "gain": gain, "offset": offset}
+    moved = motion(found, replace(sight, given=given)) * torch.tensor([1.0, 1.0, scale[0]])
+    columns = {**poses, "by_depth": by_depth, **exposures, "gain": gain, "offset": offset}
     columns |= {key: moved[:, row] for row, key in enumerate(("moved_mm", "turned_degrees", "moved_pixels"))}
     frames = [
         {"name": view.name, **{key: _plain(values[row]) for key, values in columns.items()}}
@@ -160,10 +169,29 @@ def _describe(common: Device, camera: Camera) -> dict[str, Any]:
     }
 
 
-def _poses(sight: Sight) -> tuple[Tensor, dict[str, Tensor]]:
-    """Poses [V,4,4] that the checked points approve of, and columns [V] for the report."""
-    given, checked, cell = sight.given, sight.checked, sight.checked_cell
-    found = refine_poses(sight.luminance, sight.K, given, sight.fitted, sight.spread)
+def _registered(scene: Scene, device: torch.device) -> tuple[Scene, Tensor]:
+    """The scene with grossly wrong cameras where their depth fits the mesh; and which these are, [V] bool."""
+    mesh = Mesh(scene.mesh.v_pos.to(device), scene.mesh.t_pos_idx.to(device))
+
+    def registered(view: View) -> View:
+        if view.depth is None:
+            return view
+        pose = register_camera(mesh, DepthFrame(view.camera, view.depth.to(device)))
+        return view if pose is None else replace(view, camera=replace(view.camera, world_to_camera=pose))
+
+    workers = torch.get_num_threads() if device.type == "cpu" else 1
+    views = tuple(in_threads(registered, scene.views, workers))
+    moved = [new is not old for new, old in zip(views, scene.views, strict=True)]
+    return replace(scene, views=views), torch.tensor(moved)
+
+
+def _poses(sight: Sight, given: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    """Poses [V,4,4] that the checked points approve of, and columns [V] for the report.
+
+    given: [V,4,4], what they have to be better than; where the search begins is in `sight`.
+    """
+    checked, cell = sight.checked, sight.checked_cell
+    found = refine_poses(sight.luminance, sight.K, sight.given, sight.fitted, sight.spread)
     before = look(sight.features, sight.K, given, checked, sight.size)
     good = torch.ones(len(given), dtype=torch.bool, device=given.device)
     # One view's return to its given pose changes what the others are compared with.

@@ -1,10 +1,11 @@
-"""A mesh moved onto what the depth images measured: for models that were placed by hand, as CAD models are.
+"""A mesh moved onto what the depth images measured: for models that were placed by hand, as CAD models are. And the
+other way round: a camera moved to where its depth image fits the mesh, for poses that are grossly wrong.
 
 Iterated closest points with projected pairs (Blais & Levine 1995) and point-to-plane distances (Chen & Medioni 1992):
 the mesh is rasterized into the depth cameras, each pixel pairs a reading with the face behind it, and the motion that
 takes the faces' planes to the readings is found by reweighted least squares (Tukey's weights), until it stands still.
 
-World metres. The motion acts on the mesh: rigid, with a change of scale where that is asked for.
+World metres. A mesh's motion is rigid, with a change of scale where that is asked for.
 """
 
 from __future__ import annotations
@@ -34,6 +35,10 @@ TUKEY = 4.685  # in standard deviations: 95 % efficiency on normal noise
 LEAST_DEVIATION = 0.001  # metres
 # What the pairs do not hold (a plane slides in itself) stays as it was given.
 DAMPING = 1e-4
+# Of the distance: where the readings' median lies further from the mesh, the pose is looked into. On three real scans
+# it lies at .5 to .9 %, for the worst frame at 1.4 %, and no pose leaves half of that.
+GROSS = 0.01
+LEFT = 0.5
 
 
 @dataclass(frozen=True)
@@ -81,6 +86,24 @@ def register_mesh(mesh: Mesh, frames: Sequence[DepthFrame], *, with_scale: bool 
         "scale": round(scale, 5),
     }
     return (move_mesh(mesh, motion) if accepted else mesh), report
+
+
+def register_camera(mesh: Mesh, frame: DepthFrame) -> Tensor | None:
+    """Where the frame's depth fits the mesh, as world_to_camera [4,4] float64 on the CPU; None if it is not grossly off
+    as given, or fits from nowhere near.
+
+    mesh, frame: on one device; the mesh stays. Not differentiable.
+    """
+    thinned = _thinned(frame)
+    met = _fits((mesh,), [thinned])[0]
+    readings = thinned.depth[thinned.depth > 0]
+    if len(readings) < MIN_PAIRS or met.median <= GROSS * float(readings.median()):
+        return None
+    motion, _ = _iterate(mesh, [thinned], with_scale=False)
+    before, after = _fits((mesh, move_mesh(mesh, motion)), [thinned])
+    if after.mean > LEFT * before.mean or after.median > LEFT * before.median:
+        return None
+    return frame.camera.world_to_camera.double().cpu() @ motion
 
 
 def move_mesh(mesh: Mesh, motion: Tensor) -> Mesh:

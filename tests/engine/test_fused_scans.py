@@ -132,6 +132,19 @@ def test_a_placed_model_is_moved_onto_the_depth_where_that_is_asked_for(
         assert off > 0.003
 
 
+def test_a_model_that_was_placed_further_off_is_moved_too(exact: Path, tmp_path: Path) -> None:
+    """So far that most of the depth is more than 5 % off: that speaks against the place, not against the depth."""
+    placed = trimesh.transformations.translation_matrix((0.03, -0.02, 0.02))
+    placed = placed @ trimesh.transformations.rotation_matrix(math.radians(8), (0.3, 0.5, 1))
+    scan = variant(exact, tmp_path, {"mesh_to_world": placed.tolist(), "mesh_refinement": "rigid"})
+    report = texture_scan(scan, tmp_path / "out", CONFIG, work=tmp_path / "work").report
+    assert report["registration"]["accepted"]
+    assert [warning["code"] for warning in report["warnings"]] == []
+    model, _ = load_model(tmp_path / "out" / "model.obj")
+    truth, _ = load_model(exact / "truth" / "object.obj")
+    assert float(distances(spread_points(model.mesh, 800), truth.mesh).median()) < 0.001
+
+
 def test_an_unknown_refinement_is_named(exact: Path, tmp_path: Path) -> None:
     with pytest.raises(ScanError, match=r"mesh_refinement.*choose one of none, rigid, scaled"):
         ingest(variant(exact, tmp_path, {"mesh_refinement": "magic"}), CONFIG, Monitor())

@@ -110,7 +110,9 @@ def _capture(
 ) -> Capture:
     entry = manifest.mesh
     mesh = None if entry is None else _placed(load_mesh(archive, entry.path), entry.mesh_to_world)
-    encoding = _depth_encoding(archive, manifest, mesh, config.refines, monitor)
+    # A mesh that is placed roughly, to be moved onto the depth, says nothing about the depth.
+    placed = None if entry is None or entry.refinement != "none" else mesh
+    encoding = _depth_encoding(archive, manifest, placed, config.refines, monitor)
     first = rectified(manifest.frames[0].color_intrinsics, manifest.frames[0].border)
     size = config.size or (first.width, first.height)
     every = config.holdout

@@ -29,6 +29,7 @@ JUDGED_WIDTH = 160
 AGREEMENT = 0.05
 FITTING_SHARE = 0.5
 MIN_READINGS = 500
+CLEARLY = 0.8  # of the share that agrees from other poses may agree in another unit, for the poses to be what is wrong
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ def measure_depth(
         )
         return best
     moved = _agreement_elsewhere(mesh, samples, declared) if poses_may_move else 0.0
-    if moved >= FITTING_SHARE and _agreement_scaled(declared, stored, rendered) < FITTING_SHARE:
+    if moved >= FITTING_SHARE and _agreement_scaled(declared, stored, rendered) < CLEARLY * moved:
         monitor.warning(
             Problem(
                 "poses_off",

@@ -37,7 +37,7 @@ from advtex_engine.previews import (
 )
 from advtex_engine.scene import Atlas, Scene, View
 from advtex_engine.threads import in_threads
-from advtex_engine.turntable import Circle, circle_cameras, facing, find_circle, turntable
+from advtex_engine.turntable import SIZE, Circle, circle_cameras, facing, find_circle, turntable
 
 COMPARISON, SHEET = "comparison.png", "sheet.png"
 MAX_VIEWS = 12
@@ -45,7 +45,6 @@ SHEET_VIEWS = 6
 LONGEST_SIDE = 1280
 ATLAS_SIDE = 2048
 THUMBNAIL = 256
-TINY = 200  # pixels of a view's width
 TURNTABLE_TEXTURE = 1024
 """Texels of the texture that pictures of the whole model are painted with: finer ones would flicker in them."""
 
@@ -60,14 +59,25 @@ def write_gallery(
     texture, mean: [atlas.height,atlas.width,3] float sRGB in [0,1] on the device of the atlas's mesh, which renders.
     curves: see `curves.py`. Pictures are encoded and written in a few threads while the next ones are rendered.
     """
-    gallery = _Gallery(out)
+    threads = torch.get_num_threads()
+    # Cores share the cameras; operations that share each picture as well would spend a third of the time on waiting.
+    torch.set_num_threads(1)
+    try:
+        return _write_pictures(_Gallery(out), scene, atlas, texture, mean, curves)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _write_pictures(
+    gallery: _Gallery, scene: Scene, atlas: Atlas, texture: Tensor, mean: Tensor, curves: Mapping[str, Any]
+) -> tuple[Path, ...]:
     renders = list[tuple[float, Image]]()
     gallery.save_all(_view_pictures(gallery, scene, atlas, texture, mean, renders))
     gallery.files += (gallery.folder / COMPARISON, gallery.folder / SHEET)
     circle = find_circle(atlas.mesh, scene.views, scene.up_axis)
     coarse = _coarse(texture)
-    # Textures made of tiny pictures have no detail that finer samples would show.
-    supersample = 2 if scene.views[0].camera.width >= TINY else 1
+    # Textures made of smaller pictures than the turntable's have no detail that finer samples would show.
+    supersample = 2 if scene.views[0].camera.width >= SIZE[0] else 1
     sights = enumerate(turntable(atlas, circle, supersample))
     gallery.turntable = gallery.save_all(
         (f"turntable/{frame:02d}.jpg", _painted(sight, coarse)) for frame, sight in sights

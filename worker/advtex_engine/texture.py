@@ -85,10 +85,12 @@ def sample_texels(values: Tensor, slots: Tensor, weights: Tensor) -> Tensor:
 
 def sample_image(image: Tensor, xy: Tensor) -> Tensor:
     """Bilinear samples of a dense image [H,W,C] at pixel positions xy [P,2] -> [P,C] float32. No gradient."""
-    height, width, channels = image.shape
-    indices, weights = bilinear_footprint(xy, width, height)
-    flat = image.reshape(height * width, channels).to(torch.float32)
-    return F.embedding_bag(indices, flat, per_sample_weights=weights, mode="sum")
+    height, width, _ = image.shape
+    grid = (xy * (2 / xy.new_tensor([width, height])) - 1)[None, None]
+    planes = image.to(torch.float32).permute(2, 0, 1)[None]
+    with torch.no_grad():
+        sampled = F.grid_sample(planes, grid, mode="bilinear", padding_mode="border", align_corners=False)
+    return sampled[0, :, 0].T
 
 
 def touched_slots(uv_codes: Tensor, foreground: Tensor, width: int, height: int) -> tuple[Tensor, int]:

@@ -8,6 +8,7 @@ scanned from one side alone has no other: the cameras swing to and fro on that s
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -132,7 +133,7 @@ def turntable(atlas: Atlas, circle: Circle, supersample: int = 2) -> Iterator[Si
         return look(facing(atlas, camera, circle.outer), camera, supersample)
 
     # Each camera sees a mesh of its own, so that cores share the cameras; a GPU takes them one by one.
-    workers = torch.get_num_threads() if atlas.mesh.v_pos.device.type == "cpu" else 1
+    workers = os.cpu_count() or 1 if atlas.mesh.v_pos.device.type == "cpu" else 1
     return in_threads(seen_by, circle_cameras(circle), min(workers, TOGETHER))
 
 

@@ -36,7 +36,7 @@ from advtex_engine.previews import (
     to_bytes,
 )
 from advtex_engine.scene import Atlas, Scene, View
-from advtex_engine.threads import in_threads
+from advtex_engine.threads import in_threads, one_thread_each
 from advtex_engine.turntable import SIZE, Circle, circle_cameras, facing, find_circle, turntable
 
 COMPARISON, SHEET = "comparison.png", "sheet.png"
@@ -59,13 +59,8 @@ def write_gallery(
     texture, mean: [atlas.height,atlas.width,3] float sRGB in [0,1] on the device of the atlas's mesh, which renders.
     curves: see `curves.py`. Pictures are encoded and written in a few threads while the next ones are rendered.
     """
-    threads = torch.get_num_threads()
-    # Cores share the cameras; operations that share each picture as well would spend a third of the time on waiting.
-    torch.set_num_threads(1)
-    try:
+    with one_thread_each():
         return _write_pictures(_Gallery(out), scene, atlas, texture, mean, curves)
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _write_pictures(

@@ -21,6 +21,7 @@ from advtex_engine.previews import BACKGROUND, encode_jpeg, evenly_spread, to_by
 from advtex_engine.rasterize import rasterize
 from advtex_engine.scene import Atlas, Camera, Scene, View
 from advtex_engine.texture import bilinear_footprint, sample_texels
+from advtex_engine.threads import one_thread_each
 from advtex_engine.views import DEPTH_TOLERANCE, ViewMaps
 
 SECONDS = 5.0
@@ -57,6 +58,10 @@ class Live:
         values: compact texture [slots,3] in [0,1] of the view maps. mean: [H,W,3] in [0,1], for texels that they lack.
         losses: the history so far.
         """
+        with one_thread_each():
+            self._show(step, maps, values, mean, losses)
+
+    def _show(self, step: int, maps: ViewMaps, values: Tensor, mean: Tensor, losses: Sequence[Point]) -> None:
         if not self._seen:
             views = evenly_spread(self.scene.heldout or self.scene.views, VIEWS)
             self._seen = [_Seen(self.atlas, view, self.scene.kind) for view in views]

@@ -6,7 +6,10 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import TypeVar
+
+import torch
 
 WORKERS = 4
 T = TypeVar("T")
@@ -30,3 +33,14 @@ def in_threads(function: Callable[[T], R], items: Iterable[T], workers: int | No
                 yield pending.popleft().result()
         while pending:
             yield pending.popleft().result()
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """Within it PyTorch's operations on the CPU take one thread: those on small pictures mostly wait for a second."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -104,10 +104,14 @@ def _layers(sight: Sight, texture: Tensor) -> tuple[Tensor, Tensor]:
     sampled = sample_image(texels, sight.uv * sight.uv.new_tensor([width, height]))
     if texture.dtype == torch.uint8:
         sampled /= 255
-    fine = (sight.height * sight.supersample, sight.width * sight.supersample)
-    layers = sampled.new_zeros((fine[0] * fine[1], 4))
-    layers.index_copy_(0, sight.hit, F.pad(sampled, (0, 1), value=1.0))
-    pooled = F.avg_pool2d(layers.view(1, *fine, 4).permute(0, 3, 1, 2), sight.supersample)[0].permute(1, 2, 0)
+    fine = sampled.new_zeros((sight.height * sight.width * sight.supersample**2, 4))
+    fine.index_copy_(0, sight.hit, F.pad(sampled, (0, 1), value=1.0))
+    # Rows first, then columns: avg_pool2d takes three times as long on a CPU.
+    rows = fine.view(sight.height, sight.supersample, sight.width, sight.supersample, 4).unbind(1)
+    columns = sum(rows[1:], rows[0]).unbind(2)
+    pooled = sum(columns[1:], columns[0])
+    if sight.supersample > 1:
+        pooled = pooled / sight.supersample**2
     return pooled[..., :3], pooled[..., 3]
 
 

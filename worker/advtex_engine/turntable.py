@@ -8,7 +8,6 @@ scanned from one side alone has no other: the cameras swing to and fro on that s
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -19,10 +18,8 @@ from advtex_engine.cameras import camera_center
 from advtex_engine.previews import Sight, look
 from advtex_engine.rasterize import rasterize_views
 from advtex_engine.scene import Atlas, Camera, Mesh, View
-from advtex_engine.threads import in_threads
 
 FRAMES = 24
-TOGETHER = 8  # of them that are looked at side by side, at most: each takes about 60 MB
 SIZE = (480, 360)
 FIELD_OF_VIEW = 40.0  # degrees, of the image's shorter side
 ELEVATION = {True: 48.0, False: 22.0}
@@ -128,13 +125,8 @@ def camera_at(position: Tensor, target: Tensor, up: Tensor, size: tuple[int, int
 
 def turntable(atlas: Atlas, circle: Circle, supersample: int = 2) -> Iterator[Sight]:
     """What the cameras around the circle see."""
-
-    def seen_by(camera: Camera) -> Sight:
-        return look(facing(atlas, camera, circle.outer), camera, supersample)
-
-    # Each camera sees a mesh of its own, so that cores share the cameras; a GPU takes them one by one.
-    workers = os.cpu_count() or 1 if atlas.mesh.v_pos.device.type == "cpu" else 1
-    return in_threads(seen_by, circle_cameras(circle), min(workers, TOGETHER))
+    for camera in circle_cameras(circle):
+        yield look(facing(atlas, camera, circle.outer), camera, supersample)
 
 
 def facing(atlas: Atlas, camera: Camera, outer: int) -> Atlas:

@@ -2,16 +2,18 @@
 
     python tests/benchmarks/parts.py [SCAN …] [--models 2] [--steps 1000]
 
-On synthetic scans with known truth, which have the errors that real ones have (`advtex_engine.synthesize`), and on
-scans of one's own against every 8th frame, held out. Writes parts.json (one cell per scan and variant), parts.md, and
-per synthetic object a picture: a photograph from a held-out place beside the mean, view selection and the whole; per
-real scan and variant the model and a contact sheet. Stopped and run again, it goes on with the missing cells.
+On synthetic scans with known truth, `default` with the errors that real ones have (`advtex_engine.synthesize`) and
+`geometry` with larger ones of the mesh alone, and on scans of one's own against every 8th frame, held out. Writes
+parts.json (one cell per scan and variant), parts.md, and per synthetic scan a picture: a photograph from a held-out
+place beside the mean, view selection and the whole; per real scan and variant the model and a contact sheet. Stopped
+and run again, it goes on with the missing cells.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -38,13 +40,13 @@ from harness import (
     shown_mean,
     write_report,
 )
+from study import SCANS, make_named_scan
 from torch import Tensor
 
 from advtex_engine.config import TextureConfig
 from advtex_engine.methods import MethodInput
 from advtex_engine.perceptual import Lpips
 from advtex_engine.pipeline import choose_device, resolve_preset
-from advtex_engine.synthesize import synthesize
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,15 +75,16 @@ HOLDOUT, SCAN_FACES = 8, 80_000  # of scans of one's own
 def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
     parser = common_arguments("parts", __doc__)
     parser.add_argument("scans", nargs="*", type=Path, help="folders or zip files")
+    parser.add_argument("--synthetic", nargs="*", default=list(SCANS), choices=SCANS)
     parser.add_argument("--models", type=int, default=2, help="objects, with other prints each")
     parsed: argparse.Namespace = parser.parse_args(line)
     return parsed
 
 
-def settings_of(arguments: argparse.Namespace, model: int, variant: str) -> dict[str, Any]:
+def settings_of(arguments: argparse.Namespace, synthetic: str, model: int, variant: str) -> dict[str, Any]:
     """What a cell of a synthetic scan is found by."""
     shared = {name: getattr(arguments, name) for name in ("views", "size", "steps", "preset", "faces")}
-    return {"model": model, "variant": variant, **shared}
+    return {"synthetic": synthetic, "model": model, "variant": variant, **shared}
 
 
 def scan_settings_of(arguments: argparse.Namespace, scan: Path, variant: str) -> dict[str, Any]:
@@ -93,23 +96,23 @@ def scan_settings_of(arguments: argparse.Namespace, scan: Path, variant: str) ->
 def fill(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
     """Runs every cell that is not in the results yet; the picture is drawn when all that it shows was run."""
     device = choose_device(arguments.device)
-    width, height = parsed_size(arguments.size)
-    for model in range(arguments.models):
-        missing = [name for name in VARIANTS if results.find(settings_of(arguments, model, name)) is None]
+    config = configuration(arguments, "adversarial")
+    for synthetic, model in itertools.product(arguments.synthetic, range(arguments.models)):
+        settings = {name: settings_of(arguments, synthetic, model, name) for name in VARIANTS}
+        missing = [name for name in VARIANTS if results.find(settings[name]) is None]
         if not missing:
             continue
         with tempfile.TemporaryDirectory(prefix="advtex-parts-") as folder:
             scan, work = Path(folder) / "scan", Path(folder) / "work"
-            synthesize(scan, views=arguments.views, width=width, height=height, seed=model)
+            make_named_scan(scan, synthetic, views=arguments.views, size=arguments.size, seed=model)
             truth = load_truth(scan)
-            config = configuration(arguments, "adversarial")
             shown: dict[str, Tensor] = {}
             for name, given, texture, seconds in textures(missing, scan, config, work, device):
                 shown[name] = picture(given.atlas, texture, truth)
-                scores = score_texture(given.atlas, texture, truth, lpips)
-                results.add(settings_of(arguments, model, name), scores, seconds)
+                results.add(settings[name], score_texture(given.atlas, texture, truth, lpips), seconds)
             if set(SHOWN) <= shown.keys():
-                draw(arguments.results / f"object_{model}.png", scan, truth, {name: shown[name] for name in SHOWN})
+                path = arguments.results / f"{synthetic}_{model}.png"
+                draw(path, scan, truth, {name: shown[name] for name in SHOWN})
 
 
 def fill_scans(arguments: argparse.Namespace, results: Results) -> None:
@@ -151,10 +154,13 @@ def textures(
 
 def report(arguments: argparse.Namespace, results: Results) -> None:
     """parts.md: means over the synthetic objects, then a table per scan."""
-    objects = [
-        [results.find(settings_of(arguments, model, name)) for model in range(arguments.models)] for name in VARIANTS
-    ]
-    tables = {"Synthetic scans": (SCORES, objects)}
+    tables = {}
+    for synthetic in arguments.synthetic:
+        models = range(arguments.models)
+        lines = [
+            [results.find(settings_of(arguments, synthetic, model, name)) for model in models] for name in VARIANTS
+        ]
+        tables[SCANS[synthetic]] = (SCORES, lines)
     for scan in arguments.scans:
         lines = [[results.find(scan_settings_of(arguments, scan, name))] for name in VARIANTS]
         tables[scan.stem] = (SCAN_SCORES, lines)

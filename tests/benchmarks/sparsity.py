@@ -32,7 +32,6 @@ from harness import (
     markdown_table,
     mean_of,
     needed_lpips,
-    parsed_size,
     picture,
     plot_grid,
     prepare,
@@ -40,20 +39,14 @@ from harness import (
     score_texture,
     write_report,
 )
-from study import make_scan
+from study import SCANS, make_named_scan
 from torch import Tensor
 
 from advtex_engine.config import METHODS
 from advtex_engine.perceptual import Lpips
 from advtex_engine.pipeline import choose_device, resolve_preset
-from advtex_engine.synthesize import synthesize
 
 VIRTUAL, PERTURBATION = "adversarial_virtual", 0.01
-SCANS = {
-    "default": "A scan with errors of cameras and geometry, as `advtex-engine synthesize` makes it",
-    "geometry": "The study's scan with errors of the geometry, n = 2.75",
-}
-MIDDLE_LEVEL = 2.75
 SHOWN = ("l1", "view_selection", "adversarial", VIRTUAL)
 
 
@@ -88,7 +81,7 @@ def fill(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
                 continue
             if cell["scan"] != made:
                 made = cell["scan"]
-                _make_scan(scan, cell)
+                make_named_scan(scan, made, views=cell["views"], size=cell["size"], seed=cell["seed"])
                 truth = load_truth(scan)
             virtual = cell["method"] == VIRTUAL
             config = configuration(arguments, "adversarial" if virtual else cell["method"])
@@ -105,15 +98,6 @@ def fill(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
             if set(arguments.methods) <= shown.keys():
                 draw(arguments.results / f"{made}_{given.maps[1].count}_views.png", scan, truth, shown)
             results.add(cell, scores | {"used_views": float(given.maps[1].count)}, seconds)
-
-
-def _make_scan(folder: Path, cell: dict[str, Any]) -> None:
-    if cell["scan"] == "geometry":
-        study = {"errors": "geometry", "level": MIDDLE_LEVEL, "model": cell["seed"], "turn": 0.0}
-        make_scan(folder, study | {"size": cell["size"], "views": cell["views"]})
-        return
-    width, height = parsed_size(cell["size"])
-    synthesize(folder, views=cell["views"], width=width, height=height, seed=cell["seed"])
 
 
 def report(arguments: argparse.Namespace, results: Results) -> None:

@@ -53,6 +53,12 @@ OBJECT_SIZE = 0.3
 """Metres, of the synthetic object: the unit of the paper's errors."""
 CAMERA_BASE, GEOMETRY_BASE, GROWTH = 0.01, 0.02, 1.5
 PLOTTED = ("lpips", "nearest_patch", "s3_difference", "gradient_difference")
+SCANS = {
+    "default": "Scans with errors of cameras and geometry, as `advtex-engine synthesize` makes them",
+    "geometry": "The study's scans with errors of the geometry, n = 2.75",
+}
+"""Synthetic scans that other benchmarks take."""
+MIDDLE_LEVEL = 2.75
 
 
 def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
@@ -100,6 +106,17 @@ def make_scan(folder: Path, cell: dict[str, Any]) -> None:
         camera_turn=math.radians(cell["turn"]),
         geometry_error=0.0 if of_cameras else error,
     )
+
+
+def make_named_scan(folder: Path, scan: str, *, views: int, size: str, seed: int) -> None:
+    """One of SCANS."""
+    if scan == "geometry":
+        make_scan(
+            folder, {"errors": scan, "level": MIDDLE_LEVEL, "model": seed, "turn": 0.0, "size": size, "views": views}
+        )
+        return
+    width, height = parsed_size(size)
+    synthesize(folder, views=views, width=width, height=height, seed=seed)
 
 
 class _Scans:

@@ -153,8 +153,8 @@ def test_each_part_is_switched_off_once(tmp_path: Path, weights: Path, monkeypat
     line += ["--results", str(tmp_path)]
     parts.main(line)
     page = (tmp_path / "parts.md").read_text()
-    assert all(page.count(f"| {variant} |") == 2 for variant in parts.VARIANTS)
-    assert (tmp_path / "object_0.png").stat().st_size > 1000
+    assert all(page.count(f"| {variant} |") == 3 for variant in parts.VARIANTS)
+    assert all((tmp_path / f"{scan}_0.png").stat().st_size > 1000 for scan in ("default", "geometry"))
     assert (tmp_path / "desk" / "the_whole" / "sheet.png").stat().st_size > 1000
 
     monkeypatch.setattr(parts, "prepare", lambda *_: pytest.fail("every cell is there already"))

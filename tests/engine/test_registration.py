@@ -162,6 +162,20 @@ def test_a_grossly_wrong_camera_is_put_where_its_depth_fits(frame: DepthFrame) -
     assert pixels_off(found, frame.camera) < 0.1 * before
 
 
+@pytest.mark.parametrize(
+    ("index", "shift", "degrees"),
+    [(3, (0.03, 0.12, 0.0), 5), (7, (0.09, 0.01, -0.15), 10), (1, (0.09, 0.07, -0.05), 10)],
+)
+def test_a_camera_that_slides_along_surfaces_has_the_time_to_arrive(
+    index: int, shift: tuple[float, float, float], degrees: float
+) -> None:
+    wrong = misplaced(FRAMES[index], shift, degrees)
+    found = register_camera(TRUE, wrong)
+    assert found is not None
+    assert pixels_off(wrong.camera.world_to_camera, FRAMES[index].camera) > 10
+    assert pixels_off(found, FRAMES[index].camera) < 0.1
+
+
 @pytest.mark.parametrize("degrees", [0, 0.2])
 def test_a_camera_that_is_nearly_right_stays_for_the_photographs_to_judge(degrees: float) -> None:
     assert register_camera(TRUE, misplaced(FRAMES[0], (0, 0, 0), degrees)) is None

@@ -86,7 +86,7 @@ def warped(color, depth, around, first, right, down, live, WIDTH: tl.constexpr, 
         there = around + (tap // 4 - 1) * WIDTH + tap % 4 - 1
         weight = tl.where(whole, cubic(right, tap % 4) * cubic(down, tap // 4), 0.0)
         wanted = whole
-        if tap == 5 or tap == 6 or tap == 9 or tap == 10:  # the four of the bilinear footprint
+        if tap % 4 % 3 != 0 and tap // 4 % 3 != 0:  # the four of the bilinear footprint
             beside = (right if tap % 4 == 2 else 1 - right) * (down if tap // 4 == 2 else 1 - down)
             weight = tl.where(whole, weight, beside)
             wanted = live

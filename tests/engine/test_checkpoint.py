@@ -12,8 +12,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from advtex_engine.checkpoint import MAX_SHARE, Checkpoints, WorkFolder
+from advtex_engine.checkpoint import MAX_SHARE, Checkpoints, WorkFolder, restore_generator
 from advtex_engine.monitor import Monitor
+
+STEPS = 100
 
 
 class Files(Monitor):
@@ -103,7 +105,7 @@ def folder(clock: Clock, tmp_path: Path) -> WorkFolder:
 
 
 def test_checkpoints_come_every_so_many_seconds(clock: Clock, folder: WorkFolder) -> None:
-    checkpoints = Checkpoints(folder, 30.0)
+    checkpoints = Checkpoints(folder, 30.0, STEPS)
     clock.cost = 0.1
     for _ in range(3):
         clock.now += 29.9
@@ -114,7 +116,7 @@ def test_checkpoints_come_every_so_many_seconds(clock: Clock, folder: WorkFolder
 
 
 def test_checkpoints_that_take_long_come_rarer(clock: Clock, folder: WorkFolder) -> None:
-    begun, checkpoints = clock.now, Checkpoints(folder, 30.0)
+    begun, checkpoints = clock.now, Checkpoints(folder, 30.0, STEPS)
     clock.now += 30
     assert checkpoints.due()
     clock.cost = 5.0
@@ -137,7 +139,7 @@ def test_all_checkpoints_but_the_last_keep_to_their_share(cost: float, step: flo
         clock = Clock(patch)
         folder = WorkFolder(Path(path), "run", clock)
         clock.cost = cost
-        begun, checkpoints = clock.now, Checkpoints(folder, 1.0)
+        begun, checkpoints = clock.now, Checkpoints(folder, 1.0, STEPS)
         for number in range(4):
             clock.now = max(clock.now, begun + number * cost / MAX_SHARE - step)
             while not checkpoints.due():
@@ -147,12 +149,12 @@ def test_all_checkpoints_but_the_last_keep_to_their_share(cost: float, step: flo
 
 
 def test_a_checkpoint_knows_what_all_attempts_have_spent(clock: Clock, folder: WorkFolder) -> None:
-    checkpoints = Checkpoints(folder, 30.0)
+    checkpoints = Checkpoints(folder, 30.0, STEPS)
     clock.now += 40
     checkpoints.save({"step": 1})
     clock.now += 1000
     again = WorkFolder(folder.path, "run", clock)
-    resumed = Checkpoints(again, 30.0)
+    resumed = Checkpoints(again, 30.0, STEPS)
     loaded = resumed.load()
     assert loaded is not None
     assert loaded["step"] == 1
@@ -160,5 +162,25 @@ def test_a_checkpoint_knows_what_all_attempts_have_spent(clock: Clock, folder: W
     clock.now += 2
     resumed.save({"step": 2})
     last = WorkFolder(folder.path, "run", clock)
-    Checkpoints(last, 30.0).load()
+    Checkpoints(last, 30.0, STEPS).load()
     assert last.earlier_seconds == 42
+
+
+def test_a_checkpoint_of_a_run_of_other_length_is_ignored(folder: WorkFolder) -> None:
+    Checkpoints(folder, 30.0, STEPS).save({"step": 1})
+    assert Checkpoints(folder, 30.0, STEPS).load() is not None
+    assert Checkpoints(folder, 30.0, STEPS + 1).load() is None
+
+
+def test_draws_go_on_from_a_checkpoint_of_another_kind_of_device() -> None:
+    """A GPU's generator has a state of 16 bytes, a CPU's of some thousand."""
+
+    def draws(step: int) -> torch.Tensor:
+        generator = torch.Generator().manual_seed(7)
+        restore_generator(generator, torch.zeros(16, dtype=torch.uint8), step)
+        return torch.rand(4, generator=generator)
+
+    fresh = torch.rand(4, generator=torch.Generator().manual_seed(7))
+    assert torch.equal(draws(30), draws(30))
+    assert not torch.equal(draws(30), draws(31))
+    assert not torch.equal(draws(30), fresh)

@@ -6,11 +6,13 @@ no Python, the same tensors at the same addresses. Whatever a step asks the host
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
+from unittest import mock
 
 import pytest
 import torch
@@ -20,7 +22,7 @@ from torch.utils._pytree import tree_leaves
 from advtex_engine import graphed
 from advtex_engine.config import PRESETS, Preset
 from advtex_engine.discriminator import PatchDiscriminator
-from advtex_engine.graphed import WARMUP, Stepper
+from advtex_engine.graphed import WARMUP, Stepper, capture_graph
 from advtex_engine.operations import plain_operations
 from advtex_engine.optimize import AdversarialOptimizer
 from advtex_engine.planar import planar_views
@@ -188,6 +190,27 @@ def test_a_capture_that_fails_leaves_single_steps_and_the_reason() -> None:
         "channels": 6,
         "reasons": {"graph": "the capture failed: operation not permitted when stream is capturing"},
     }
+
+
+def test_a_capture_that_fails_gives_stream_and_generator_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """torch ends the capture before it leaves the capture's stream, and does not leave it when the end raises."""
+    current = ["main"]
+
+    @contextlib.contextmanager
+    def graph(*_: object, **__: object) -> Iterator[None]:
+        current[0] = "capture"
+        yield
+        raise RuntimeError("the capture was invalidated")
+
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", mock.Mock())
+    monkeypatch.setattr(torch.cuda, "graph", graph)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda _: current[0])
+    monkeypatch.setattr(torch.cuda, "set_stream", lambda stream: current.__setitem__(0, stream))
+    generator = mock.Mock()
+    with pytest.raises(RuntimeError, match="invalidated"):
+        capture_graph(lambda: None, generator)
+    assert current == ["main"]
+    generator.graphsafe_set_state.assert_called_once_with(generator.clone_state.return_value)
 
 
 def test_a_cpu_takes_single_steps() -> None:

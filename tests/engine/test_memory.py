@@ -19,9 +19,10 @@ from advtex_contract.options import Preset as Presets
 from advtex_engine import memory
 from advtex_engine.config import PRESETS, Preset
 from advtex_engine.discriminator import PatchDiscriminator
-from advtex_engine.memory import Workload, available_memory, estimate, memory_problem, tensor_bytes
+from advtex_engine.memory import Workload, available_memory, estimate, tensor_bytes
 from advtex_engine.optimize import AdversarialOptimizer
 from advtex_engine.planar import planar_views
+from advtex_engine.shortage import memory_problem
 from advtex_engine.views import ViewMaps
 from advtex_store.needs import needed_memory
 
@@ -183,6 +184,7 @@ def test_other_methods_have_no_discriminator(method: str) -> None:
             True,
         ),
         (RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling cublasCreate"), True),
+        (RuntimeError("GET was unable to find an engine to execute this computation"), True),
         (OSError(errno.ENOMEM, os.strerror(errno.ENOMEM)), True),
         (OSError(errno.ENOSPC, "No space left on device"), False),
         (RuntimeError("shapes do not match"), False),

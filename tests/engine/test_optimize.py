@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+from typing import Any
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from advtex_engine.config import PRESETS, Preset
 from advtex_engine.discriminator import PatchDiscriminator
 from advtex_engine.examples import assemble
 from advtex_engine.losses import adversarial_loss, discriminator_loss, l1_loss, patch_masks
+from advtex_engine.operations import plain_operations
 from advtex_engine.optimize import AdversarialOptimizer, crop_size
 from advtex_engine.planar import planar_views
 from advtex_engine.texture import bilinear_footprint, decode_uv
@@ -266,3 +268,33 @@ def test_examples_are_aligned_with_the_source_before_they_are_judged() -> None:
     assert shown.fake.requires_grad
     assert bool((shown.visible == 1).all())
     assert float(of.play(moved).l1.detach()) != float(plain.play(moved).l1.detach())
+
+
+def test_a_run_goes_on_from_a_checkpoint_of_another_kind_of_device() -> None:
+    first, second = optimizer(), optimizer()
+    for _ in range(3):
+        first.step()
+    second.load_state_dict(first.state_dict() | {"generator": torch.zeros(16, dtype=torch.uint8)})
+    second.step()
+    assert second.index == 4
+    assert second.values.isfinite().all()
+
+
+def test_operations_that_fail_in_a_step_are_replaced_by_the_plain_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise RuntimeError("no such instruction")
+
+    def chosen(**changes: Any) -> AdversarialOptimizer:
+        operations = dataclasses.replace(plain_operations(), name="fast", **changes)
+        monkeypatch.setattr("advtex_engine.optimize.choose_operations", lambda _: operations)
+        return optimizer()
+
+    assert chosen().operations.name == "fast"
+    failing = chosen(assemble=broken)
+    assert (failing.operations.name, failing.operations.reason) == ("torch", "fast failed: no such instruction")
+    # Trying them out has changed nothing.
+    monkeypatch.undo()
+    plain = optimizer()
+    for of in (failing, plain):
+        of.step()
+    assert all(torch.equal(a, b) for a, b in zip(state(failing), state(plain), strict=True))

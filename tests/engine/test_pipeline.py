@@ -341,6 +341,15 @@ def test_a_device_that_is_not_there_is_named() -> None:
         choose_device("cuda:77")
 
 
+def test_a_gpu_has_its_index(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "set_device", lambda _: None)
+    monkeypatch.setattr(torch, "empty", lambda *_, **__: None)
+    assert choose_device("auto") == choose_device("cuda") == torch.device("cuda:1")
+    assert choose_device("cuda:0") == torch.device("cuda:0")
+
+
 def test_a_file_that_is_no_scan_is_refused_with_a_remedy(tmp_path: Path) -> None:
     path = tmp_path / "scan.zip"
     path.write_bytes(b"not a zip")

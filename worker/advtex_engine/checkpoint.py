@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, cast
 
 import torch
+from torch import Tensor
 
 from advtex_engine.files import atomic_file
 from advtex_engine.monitor import Monitor
@@ -82,22 +83,34 @@ class _Watched:
         self.file.flush()
 
 
+def restore_generator(generator: torch.Generator, state: Tensor, step: int) -> None:
+    """Goes on from a saved state. That of another kind of device, which has another size, says nothing here: the draws
+    after `step` begin with a seed of their own."""
+    if state.shape == generator.get_state().shape:
+        generator.set_state(state)
+    else:
+        generator.manual_seed(generator.initial_seed() + step)
+
+
 class Checkpoints:
     """The checkpoint of a run's optimization; made at its start, loaded, and then saved from time to time.
 
     The next one is due every `seconds`, and later while checkpoints have taken more than MAX_SHARE of the time.
+    steps: of the whole run. A checkpoint of a run with another number is of no use to this one; that happens where the
+    preset "auto" is decided anew, on another kind of device.
     """
 
-    def __init__(self, work: WorkFolder, seconds: float) -> None:
-        self.work, self.seconds = work, seconds
+    def __init__(self, work: WorkFolder, seconds: float, steps: int) -> None:
+        self.work, self.seconds, self.steps = work, seconds, steps
         self._started = self._last = time.monotonic()
         self._saving = 0.0
 
     def load(self) -> dict[str, Any] | None:
         """What `save` was given, of the work folder's checkpoint; None without one."""
         saved = self.work.load(CHECKPOINT)
-        if saved is not None:
-            self.work.earlier_seconds = saved["seconds"]
+        if saved is None or saved.get("steps", self.steps) != self.steps:
+            return None
+        self.work.earlier_seconds = saved["seconds"]
         return saved
 
     def due(self) -> bool:
@@ -109,6 +122,6 @@ class Checkpoints:
         """Replaces the checkpoint; beside `content` it holds what all attempts have spent on the optimization."""
         before = time.monotonic()
         seconds = self.work.earlier_seconds + before - self._started
-        self.work.save(CHECKPOINT, {"seconds": seconds, **content})
+        self.work.save(CHECKPOINT, {"seconds": seconds, "steps": self.steps, **content})
         self._last = time.monotonic()
         self._saving += self._last - before

@@ -8,13 +8,18 @@ from advtex_engine.errors import OptionError
 
 
 def choose_device(name: str) -> torch.device:
-    """ "auto" is the GPU when there is one. Raises OptionError for a device that is not there."""
+    """ "auto" is the GPU when there is one. Raises OptionError for a device that is not there.
+
+    A GPU has its index: tensors name theirs, and cuda:0 is not equal to cuda.
+    """
     if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         device = torch.device(name)
+        if device.type == "cuda" and device.index is None:
+            device = torch.device("cuda", torch.cuda.current_device())
         torch.empty(0, device=device)
-        if device.type == "cuda" and device.index is not None:
+        if device.type == "cuda":
             torch.cuda.set_device(device)  # where kernels that are not torch's are launched
     except (RuntimeError, AssertionError) as error:
         raise OptionError(f"device {name!r} is not available here ({error}); use auto, cpu or cuda") from error

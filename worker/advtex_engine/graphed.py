@@ -111,7 +111,7 @@ class Stepper:
 
 def capture_graph(work: Callable[[], None], generator: torch.Generator) -> Callable[[], None]:
     """Captures `work` on the generator's device; raises RuntimeError, with the generator as it was, if it cannot be."""
-    before = generator.clone_state()
+    before, stream = generator.clone_state(), torch.cuda.current_stream(generator.device)
     graph = torch.cuda.CUDAGraph()
     graph.register_generator_state(generator)
     try:
@@ -119,7 +119,8 @@ def capture_graph(work: Callable[[], None], generator: torch.Generator) -> Calla
         with torch.cuda.graph(graph, capture_error_mode="thread_local"):
             work()
     except RuntimeError:
-        # A capture that broke off leaves the generator's state marked as captured.
+        # A capture that broke off leaves its stream the current one, and the generator's state marked as captured.
+        torch.cuda.set_stream(stream)
         generator.graphsafe_set_state(before)
         raise
     return graph.replay

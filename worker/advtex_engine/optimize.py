@@ -24,12 +24,14 @@ from torch import Tensor
 
 from advtex_engine.alignment import BLOCK, block_offsets, search_bound
 from advtex_engine.batches import Batch, PairSampler
+from advtex_engine.checkpoint import restore_generator
 from advtex_engine.config import Preset
 from advtex_engine.discriminator import MIN_SIZE, PatchDiscriminator
 from advtex_engine.examples import InputForm
 from advtex_engine.losses import adversarial_loss, discriminator_loss, feature_loss, l1_loss, patch_masks
-from advtex_engine.operations import Operations, choose_operations
+from advtex_engine.operations import Operations, choose_operations, plain_operations
 from advtex_engine.schedule import Schedule
+from advtex_engine.shortage import memory_problem
 from advtex_engine.views import Pairs, ViewMaps
 
 CROP_SHARE = 0.1  # the released code shifts its crop by up to 69 of 640 pixels, about a tenth of the width
@@ -108,6 +110,8 @@ class AdversarialOptimizer:
         self.sampler = PairSampler(maps, pairs, kind, self.crop, generator, perturbation)
         self._sums = torch.zeros(len(LOSS_NAMES), device=device)
         self._summed = 0
+        if operations is None and self.operations.name != "torch":
+            self._try_operations()
 
     @property
     def index(self) -> int:
@@ -122,6 +126,21 @@ class AdversarialOptimizer:
     def pretraining(self) -> bool:
         """Whether the texture still waits for the discriminator."""
         return self.schedule.pretraining_at(self.index)
+
+    def _try_operations(self) -> None:
+        """Takes the plain ones, with the reason, where the device's own fail in a step that changes nothing."""
+        before = self.generator.get_state()
+        try:
+            gradient = self.texture_gradient(self.play(self.draw()))
+            finite = bool(gradient.isfinite().all())
+        except Exception as error:
+            if memory_problem(error) is not None:
+                raise
+            self.operations = plain_operations(f"{self.operations.name} failed: {error}")
+        else:
+            if not finite:
+                self.operations = plain_operations(f"{self.operations.name} gives gradients that are not finite")
+        self.generator.set_state(before)
 
     def draw(self) -> Batch:
         """A random pair and crop, with the auxiliary view warped into the source."""
@@ -257,7 +276,7 @@ class AdversarialOptimizer:
         self.discriminator.load_state_dict(state["discriminator"])
         _load_adam(self.adam_texture, state["adam_texture"])
         _load_adam(self.adam_discriminator, state["adam_discriminator"])
-        self.generator.set_state(state["generator"])
+        restore_generator(self.generator, state["generator"], self.index)
 
     def _autocast(self) -> contextlib.AbstractContextManager[Any]:
         if not self.bfloat16:

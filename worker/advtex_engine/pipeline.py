@@ -34,7 +34,7 @@ from advtex_engine.geometry import clean, decimate
 from advtex_engine.ingest import opened, read_capture
 from advtex_engine.limits import Budget
 from advtex_engine.live import Live
-from advtex_engine.memory import Workload, held_bytes, memory_problem
+from advtex_engine.memory import Workload, held_bytes
 from advtex_engine.methods import METHODS, MethodInput, require
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.view_selection import select_views
@@ -54,6 +54,7 @@ from advtex_engine.report import (
 )
 from advtex_engine.result_page import write_page
 from advtex_engine.scene import Atlas, Mesh, Scene, View
+from advtex_engine.shortage import memory_problem
 from advtex_engine.streaming import host_allocator, keep_off
 from advtex_engine.texture import fill_holes
 from advtex_engine.toning import tone_views

@@ -200,6 +200,10 @@ class StreamedViews:
         )
         self.held = torch.full((places,), -1)
         self._copies = torch.cuda.Stream(device) if device.type == "cuda" else None  # type: ignore[no-untyped-call]
+        if self._copies is not None:  # copies may still be under way when these are let go
+            for tensor in (*vars(self.maps).values(), *vars(self.pairs).values()):
+                if isinstance(tensor, Tensor) and tensor.is_cuda:
+                    tensor.record_stream(self._copies)
         self._start(0)
 
     def advance(self, steps: int) -> None:

@@ -42,7 +42,7 @@ def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     # Weights are drawn on the CPU, so that a run starts from the same discriminator on every device.
     discriminator = PatchDiscriminator(torch.Generator().manual_seed(given.config.seed)).to(device)
     generator = torch.Generator(device).manual_seed(given.config.seed)
-    checkpoints = Checkpoints(given.work, given.config.checkpoint_seconds)
+    checkpoints = Checkpoints(given.work, given.config.checkpoint_seconds, preset.steps)
     saved = checkpoints.load()
     run = _Run(saved["level"], saved["step"], saved["losses"]) if saved else _Run(0, 0, [])
     if saved:

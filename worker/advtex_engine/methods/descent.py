@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from advtex_engine.checkpoint import Checkpoints
+from advtex_engine.checkpoint import Checkpoints, restore_generator
 from advtex_engine.errors import Stopped
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.methods.mean import dense_texture
@@ -41,7 +41,7 @@ def descend(
     adam = torch.optim.Adam([values], lr=LR, fused=True)
     total = torch.zeros((), device=values.device)
     first, losses = 0, list[LossPoint]()
-    checkpoints = Checkpoints(given.work, given.config.checkpoint_seconds)
+    checkpoints = Checkpoints(given.work, given.config.checkpoint_seconds, steps)
     saved = checkpoints.load()
     if saved is not None:
         first, losses = saved["step"], saved["losses"]
@@ -49,7 +49,7 @@ def descend(
         values.data.copy_(saved["values"])
         total.copy_(saved["total"])
         adam.load_state_dict(saved["adam"])
-        generator.set_state(saved["generator"])
+        restore_generator(generator, saved["generator"], first)
         if views is not None:
             views.load_state_dict(saved["views"])
     every = max(1, steps // HISTORY_POINTS)

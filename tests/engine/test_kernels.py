@@ -17,7 +17,7 @@ from torch import Tensor
 from advtex_engine import examples, losses, texture
 from advtex_engine.alignment import BLOCK
 from advtex_engine.batches import PairSampler
-from advtex_engine.config import PRESETS
+from advtex_engine.config import PRESETS, Preset
 from advtex_engine.discriminator import PatchDiscriminator
 from advtex_engine.examples import InputForm
 from advtex_engine.operations import choose_operations, plain_operations
@@ -160,16 +160,18 @@ def test_the_average_moves_by_its_weight(fused: ModuleType) -> None:
         torch.testing.assert_close(ours, mean.lerp(state, weight))
 
 
-def optimizer(fused: ModuleType | None) -> AdversarialOptimizer:
+ONE_STEP = dataclasses.replace(PRESETS["standard"], pretraining=0, averaging=20, max_crop=(64, 64))
+
+
+def optimizer(fused: ModuleType | None, preset: Preset = ONE_STEP, steps: int = 100) -> AdversarialOptimizer:
     maps, pairs = planar_views(3, 72, 72, 1.2, DEVICE)
-    preset = dataclasses.replace(PRESETS["standard"], pretraining=0, averaging=20, max_crop=(64, 64))
     of = AdversarialOptimizer(
         maps,
         pairs,
         torch.rand((maps.slots, 3), generator=torch.Generator().manual_seed(5)).to(DEVICE),
         preset,
         kind="scene",
-        steps=100,
+        steps=steps,
         generator=torch.Generator(DEVICE).manual_seed(0),
         discriminator=PatchDiscriminator(torch.Generator().manual_seed(0)).to(DEVICE),
         operations=plain_operations() if fused is None else fused.triton_operations(),
@@ -194,6 +196,27 @@ def test_a_step_on_the_kernels_is_a_step_on_torch(fused: ModuleType) -> None:
         assert a.shape == b.shape
         assert float(((a - b).detach().abs() > 0.2 * ours.preset.lr_discriminator).float().mean()) < 0.02
     assert ours.drain_losses() == pytest.approx(plain.drain_losses(), rel=1e-3)
+
+
+@pytest.mark.slow
+def test_two_hundred_steps_on_the_kernels_end_like_those_on_torch(
+    fused: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fused, "BLOCK", 1024)  # a crop: the interpreter computes what a program masks, too
+    preset = dataclasses.replace(
+        PRESETS["paper"], pretraining=20, averaging=50, lr_end=0.1, lr_discriminator=3e-4, max_crop=(32, 32)
+    )
+    ours, plain = optimizer(fused, preset, 200), optimizer(None, preset, 200)
+    start = plain.values.detach().clone()
+    for _ in range(200):
+        ours.step()
+        plain.step()
+    assert float((plain.values - start).detach().abs().mean()) > 0.01, "the texture has gone somewhere"
+    losses = plain.drain_losses()
+    assert 0.05 < losses["skipped"] < 0.95, "both ways were taken"
+    assert losses == pytest.approx(ours.drain_losses(), rel=1e-3)
+    torch.testing.assert_close(ours.values, plain.values, atol=2e-3, rtol=0)
+    torch.testing.assert_close(ours.average, plain.average, atol=2e-3, rtol=0)
 
 
 def test_the_operations_are_chosen_with_a_reason(fused: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -126,6 +126,7 @@ class _Assemble(torch.autograd.Function):
         )
         ctx.save_for_backward(moved[2], *(() if offsets is None else (offsets,)))
         ctx.sizes = sizes
+        ctx.set_materialize_grads(False)  # where L1 holds on to the start, nothing comes for the moved example
         if offsets is None:
             ctx.mark_non_differentiable(inputs[1])
             return (*inputs,)
@@ -135,6 +136,7 @@ class _Assemble(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> tuple[Tensor | None, ...]:
         visible, *offsets = ctx.saved_tensors
+        assert grads[0] is not None, "the fake example is always judged"
         of_input = _rows(grads[0])
         of_moved = _rows(grads[2]) if len(grads) > 2 and grads[2] is not None else None
         height, width = visible.shape[-2:]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
+import sqlite3
 import time
 from pathlib import Path
 
@@ -89,11 +91,18 @@ def test_the_whole_tree(service: LiveService, scan: Path) -> None:
 
 
 def test_a_stopped_worker_that_wakes_up_late_commits_nothing(service: LiveService, scan: Path) -> None:
-    """SIGSTOP is what a swapping or suspended machine looks like: the lease runs out, and then it goes on."""
+    """SIGSTOP is what a swapping or suspended machine looks like: the lease runs out, and then it goes on.
+
+    It is stopped between two of its writes: SQLite's lock would stop with it, and everybody wait for its return.
+    """
     with service.client() as client:
         job_id, tree = begin(service, client, scan)
-        for pid in tree:
-            os.kill(pid, signal.SIGSTOP)
+        with contextlib.closing(
+            sqlite3.connect(service.folder / "data" / "advtex.db", timeout=15, isolation_level=None)
+        ) as database:
+            database.execute("BEGIN IMMEDIATE")
+            for pid in tree:
+                os.kill(pid, signal.SIGSTOP)
         service.start_worker("stepping")
         wait_until(lambda: client.get_job(job_id).attempt == 2)
         for pid in tree:

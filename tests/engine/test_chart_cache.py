@@ -7,6 +7,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,14 +15,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from advtex_engine import chart_cache, pipeline
+from advtex_engine import chart_cache, ingest, pipeline
 from advtex_engine.atlas import begin_charts, build_atlas
 from advtex_engine.bench_scene import made_scene
 from advtex_engine.chart_cache import ChartMaker, Position, chart_key
 from advtex_engine.charting import Charts, Integers, make_charts
 from advtex_engine.config import TextureConfig
-from advtex_engine.errors import Stopped
+from advtex_engine.errors import Problem, ScanError, Stopped
 from advtex_engine.monitor import Monitor
+from advtex_engine.preparation import MeshPreparation
 from advtex_engine.scene import Mesh
 from advtex_engine.synthesize import synthesize
 
@@ -268,6 +270,52 @@ def test_a_run_begins_with_the_charts_early_and_the_next_one_finds_them(
         atlases.append(torch.load(tmp_path / run / "work" / "atlas.pt", weights_only=True))
     assert made == ["ahead"]
     assert atlases[0]["v_uv"].equal(atlases[1]["v_uv"])
+
+
+def test_what_is_said_of_a_mesh_that_is_made_ready_is_said_on_the_runs_thread() -> None:
+    class Told(Monitor):
+        def warning(self, problem: Problem) -> None:
+            assert threading.current_thread() is threading.main_thread()
+            said.append(problem.code)
+
+    said = list[str]()
+    scene, _ = made_scene(600, 1, 32, 24)
+    with ChartMaker(None) as maker, MeshPreparation(300, maker) as preparation:
+        preparation.begin(scene.mesh, moves=True)
+        mesh = preparation.result(Told())
+        assert maker._begun is None  # charts of a mesh that moves would be of no use
+        preparation.begin(Mesh(mesh.v_pos, mesh.t_pos_idx))
+        preparation.result(Told())
+        assert maker._begun is not None
+        preparation.begin(Mesh(mesh.v_pos * 0, mesh.t_pos_idx))
+        with pytest.raises(ScanError, match="has an area"):
+            preparation.result(Told())
+    assert len(mesh.t_pos_idx) <= 300
+    assert said == ["uv_dropped"]
+
+
+@pytest.mark.slow
+def test_charts_are_begun_while_frames_are_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scan = tmp_path / "scan"
+    synthesize(scan, views=4, width=96, height=72)
+    begun = threading.Event()
+
+    def make(position: Position, faces: Integers, monitor: Monitor, *, apart: bool = False) -> Charts:
+        begun.set()
+        return make_charts(position, faces, monitor)
+
+    decode = ingest.color_image
+
+    def decode_later(*given: Any) -> Any:
+        assert begun.wait(60)  # no frame is decoded before
+        return decode(*given)
+
+    monkeypatch.setattr(chart_cache, "make_charts", make)
+    monkeypatch.setattr(ingest, "color_image", decode_later)
+    monkeypatch.setattr(pipeline, "charts_folder", lambda: tmp_path / "charts")
+    config = TextureConfig(face_budget=500, refine=False, device="cpu")
+    with pytest.raises(Stopped):
+        pipeline.texture_scan(scan, tmp_path / "out", config, work=tmp_path / "work", monitor=UntilAtlas())
 
 
 class UntilAtlas(Monitor):

@@ -6,7 +6,7 @@ memory holds no more than a few full images.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -49,9 +49,13 @@ from advtex_scan.manifest import (
     FileRef,
     FrameEntry,
     Matrix4,
+    MeshRefinement,
     ScanManifest,
     VideoFrame,
 )
+
+OnMesh = Callable[[Mesh, MeshRefinement], None]
+"""Mesh in world coordinates, and how it may still be moved."""
 
 MAX_IMAGE_BYTES = 256 << 20
 # Frames whose depth is compared with the mesh to find out how it is encoded.
@@ -71,8 +75,13 @@ def ingest(scan: Path, config: TextureConfig, monitor: Monitor) -> Scene:
         return _with_mesh(read_capture(scan, config, store, monitor), monitor)
 
 
-def read_capture(scan: Path, config: TextureConfig, store: FrameStore, monitor: Monitor) -> Capture:
-    """`ingest` before a mesh is fused and views are left out. The capture's frames are in the store."""
+def read_capture(
+    scan: Path, config: TextureConfig, store: FrameStore, monitor: Monitor, on_mesh: OnMesh | None = None
+) -> Capture:
+    """`ingest` before a mesh is fused and views are left out. The capture's frames are in the store.
+
+    on_mesh: told the scan's own mesh, if it brings one, before its frames are decoded.
+    """
     with opened(scan) as archive:
         reading = read_scan(archive, config.layout)
         errors = [_problem(finding) for finding in reading.report.findings if finding.severity == "error"]
@@ -81,7 +90,7 @@ def read_capture(scan: Path, config: TextureConfig, store: FrameStore, monitor: 
         for finding in reading.report.findings:
             if finding.severity == "warning":
                 monitor.warning(_problem(finding))
-        return _capture(archive, reading.manifest, config, store, monitor)
+        return _capture(archive, reading.manifest, config, store, monitor, on_mesh)
 
 
 @contextmanager
@@ -106,10 +115,18 @@ def _with_mesh(capture: Capture, monitor: Monitor) -> Scene:
 
 
 def _capture(
-    archive: ScanArchive, manifest: ScanManifest, config: TextureConfig, store: FrameStore, monitor: Monitor
+    archive: ScanArchive,
+    manifest: ScanManifest,
+    config: TextureConfig,
+    store: FrameStore,
+    monitor: Monitor,
+    on_mesh: OnMesh | None = None,
 ) -> Capture:
-    entry = manifest.mesh
-    mesh = None if entry is None else _placed(load_mesh(archive, entry.path), entry.mesh_to_world)
+    entry, mesh = manifest.mesh, None
+    if entry is not None:
+        mesh = _placed(load_mesh(archive, entry.path), entry.mesh_to_world)
+        if on_mesh is not None:
+            on_mesh(mesh, entry.refinement)
     # A mesh that is placed roughly, to be moved onto the depth, says nothing about the depth.
     placed = None if entry is None or entry.refinement != "none" else mesh
     encoding = _depth_encoding(archive, manifest, placed, config.refines, monitor)

@@ -30,7 +30,6 @@ from advtex_engine.errors import MemoryShortage, OptionError
 from advtex_engine.export import export_model
 from advtex_engine.fusion import fuse
 from advtex_engine.gallery import write_gallery
-from advtex_engine.geometry import clean, decimate
 from advtex_engine.ingest import opened, read_capture
 from advtex_engine.limits import Budget
 from advtex_engine.live import Live
@@ -40,6 +39,7 @@ from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.view_selection import select_views
 from advtex_engine.monitor import Monitor
 from advtex_engine.optimize import native_bfloat16
+from advtex_engine.preparation import MeshPreparation
 from advtex_engine.refine import apply_refinement, refine_cameras, refinement_from_dict, refinement_to_dict
 from advtex_engine.registration import MAX_FRAMES, register_mesh
 from advtex_engine.report import (
@@ -209,25 +209,26 @@ def _make_scene(
 ) -> tuple[Scene, dict[str, Any]]:
     monitor = stages.monitor
     made: dict[str, Any] = {"conventions": None, "fusion": None, "registration": None}
-    with stages.run("ingest"):
-        capture = read_capture(scan, config, store, monitor)
-    with stages.run("conventions"):
-        made["conventions"] = judge(scan, capture.manifest, capture.mesh, monitor)
-    mesh = capture.mesh
-    if mesh is None:
-        with stages.run("fusion"):
-            mesh, made["fusion"] = fuse(capture.measured(), device, monitor)
-    with stages.run("geometry"):
-        mesh = decimate(clean(mesh), config.face_budget, monitor)
-        if capture.mesh_refinement == "none":
-            begin_charts(mesh, charts)  # they are made while views are chosen and cameras refined
-        capture, made["view_choice"] = capture.choose(mesh, config.max_views, monitor)
-        scene = capture.scene(mesh, monitor)
-        if capture.mesh_refinement != "none" and (frames := capture.measured(MAX_FRAMES)):
-            with_scale = capture.mesh_refinement == "scaled"
-            mesh, made["registration"] = register_mesh(scene.mesh, frames, with_scale=with_scale)
-            scene = replace(scene, mesh=mesh)
-        begin_charts(scene.mesh, charts)
+    with MeshPreparation(config.face_budget, charts) as preparation:
+        with stages.run("ingest"):
+            capture = read_capture(
+                scan, config, store, monitor, lambda mesh, moves: preparation.begin(mesh, moves=moves != "none")
+            )
+        with stages.run("conventions"):
+            made["conventions"] = judge(scan, capture.manifest, capture.mesh, monitor)
+        if capture.mesh is None:
+            with stages.run("fusion"):
+                fused, made["fusion"] = fuse(capture.measured(), device, monitor)
+            preparation.begin(fused)
+        with stages.run("geometry"):
+            mesh = preparation.result(monitor)
+            capture, made["view_choice"] = capture.choose(mesh, config.max_views, monitor)
+            scene = capture.scene(mesh, monitor)
+            if capture.mesh_refinement != "none" and (frames := capture.measured(MAX_FRAMES)):
+                with_scale = capture.mesh_refinement == "scaled"
+                mesh, made["registration"] = register_mesh(scene.mesh, frames, with_scale=with_scale)
+                scene = replace(scene, mesh=mesh)
+            begin_charts(scene.mesh, charts)
     return scene, made
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 
+from advtex_engine import views
 from advtex_engine.cameras import project, unproject
 from advtex_engine.pipeline import shrink
 from advtex_engine.refine_points import surface_depths
@@ -177,6 +179,27 @@ def test_pairs_obey_angle_and_overlap_and_hold_the_view_itself_once() -> None:
     assert pairs.sources.tolist() == [0, 1, 2, 3]
     relative = cameras[1].world_to_camera @ torch.linalg.inv(cameras[0].world_to_camera)
     torch.testing.assert_close(pairs.relative[0, rows[0].index(1)], relative[:3].float())
+
+
+def test_overlaps_are_the_same_where_views_come_from_the_host_and_each_is_copied_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    maps = maps_of([camera_at(0.1 * index, 3.0 * index) for index in range(5)] + [camera_at(0.0, 180.0)])
+    share = overlaps(maps, "object", 15.0, range(6))
+    copied = list[int]()
+
+    class Copied(torch.Tensor):
+        def to(self, *given: Any) -> torch.Tensor:
+            if self.dim() == 2:
+                copied.append(len(self))
+            return self.as_subclass(torch.Tensor).to(*given)
+
+    other = torch.device("cpu:0")  # not equal to the tensors' device
+    monkeypatch.setattr(ViewMaps, "device", property(lambda _: other))
+    monkeypatch.setattr(views, "TOGETHER", 4)
+    elsewhere = replace(maps, depth=maps.depth.as_subclass(Copied))
+    assert overlaps(elsewhere, "object", 15.0, range(6)).equal(share)
+    assert copied == [4, 2]
 
 
 def test_a_view_without_near_neighbors_gets_the_one_that_overlaps_most() -> None:

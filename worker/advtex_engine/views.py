@@ -8,7 +8,7 @@ Views that do not fit on the device stay on the host, and go there one by one (`
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -164,26 +164,32 @@ def overlaps(maps: ViewMaps, kind: str, max_angle: float, sources: Iterable[int]
     xy = (torch.stack((xs.repeat(len(ys)), ys.repeat_interleave(len(xs))), 1) + 0.5).to(device)
     share = torch.zeros((maps.count, maps.count), device=device)
     camera_to_world = torch.linalg.inv(maps.world_to_camera)
+    points = dict[int, Tensor]()
     for source in sources:
         depth = maps.depth[source, pixels].to(device, torch.float32)
         seen = depth > 0
-        auxiliary = near[source].nonzero().flatten()
-        if not bool(seen.any()):
-            continue
-        points = unproject_pixels(xy[seen], depth[seen], maps.intrinsics[source])
-        for some in torch.split(auxiliary, TOGETHER):
-            relative = (maps.world_to_camera[some] @ camera_to_world[source])[:, :3].to(torch.float32)
-            share[source, some] = _seen_share(points, relative, maps, some, DEPTH_TOLERANCE[kind])
+        if bool(seen.any()):
+            points[source] = unproject_pixels(xy[seen], depth[seen], maps.intrinsics[source])
+    for first, block in _blocks(maps):
+        for source in points:
+            auxiliary = near[source, first : first + len(block.depth)].nonzero().flatten()
+            for start in range(0, len(auxiliary), TOGETHER):
+                some = auxiliary[start : start + TOGETHER]
+                relative = (maps.world_to_camera[first + some] @ camera_to_world[source])[:, :3].to(torch.float32)
+                seen_by = seen_share(points[source], relative, block, some, DEPTH_TOLERANCE[kind])
+                share[source, first + some] = seen_by
     return share
 
 
-def _seen_share(points: Tensor, relative: Tensor, maps: ViewMaps, auxiliary: Tensor, tolerance: float) -> Tensor:
-    """`seen_share`, for views that lie on the host too."""
-    if maps.depth.device == maps.device:
-        return seen_share(points, relative, maps, auxiliary, tolerance)
-    depth = maps.depth[auxiliary.to(maps.depth.device)].to(maps.device)
-    there = replace(maps, depth=depth, intrinsics=maps.intrinsics[auxiliary])
-    return seen_share(points, relative, there, torch.arange(len(auxiliary), device=maps.device), tolerance)
+def _blocks(maps: ViewMaps) -> Iterator[tuple[int, ViewMaps]]:
+    """The maps with only some views' depth and intrinsics, and the first of these views; depth is on the device.
+
+    All at once where it is there already, else TOGETHER at a time, so that each view is copied once.
+    """
+    together = maps.count if maps.depth.device == maps.device else TOGETHER
+    for first in range(0, maps.count, together):
+        part = slice(first, first + together)
+        yield first, replace(maps, depth=maps.depth[part].to(maps.device), intrinsics=maps.intrinsics[part])
 
 
 def foregrounds(maps: ViewMaps) -> Tensor:

@@ -68,8 +68,10 @@ def page(cells: Sequence[Cell]) -> str:
         told = [cell["date"], device_of(result), f"{result['load']:.1f}", shape, result["preset"]]
         rows.append([*told, *(f"{figure:.4g}" for figure in figures), *rates])
     measured = {cell["result"]["device"] for cell in cells}
-    rows += [["-", name, *["not measured"] * (len(HEADER) - 2)] for name in WANTED if name not in measured]
-    text = "# Steps and stages on devices\n\n" + INTRODUCTION + "\n" + markdown_table(HEADER, rows)
+    missing = [name for name in WANTED if name not in measured]
+    rows += [["-", name, *["not measured"] * (len(HEADER) - 2)] for name in missing]
+    introduction = INTRODUCTION + (NOT_AT_HAND.format(" and no ".join(missing)) if missing else "")
+    text = "# Steps and stages on devices\n\n" + introduction + "\n" + markdown_table(HEADER, rows)
     newest = {(device_of(cell["result"]), cell["result"]["width"], cell["result"]["preset"]): cell for cell in cells}
     for cell in newest.values():
         text += details(cell)
@@ -80,7 +82,14 @@ INTRODUCTION = """\
 Floors: bytes over the speed of a large copy plus operations over that of a large matrix product, both measured in the
 same run (`advtex_engine/bench_counts.py` says what is counted). Load: of the whole machine, in the minute before the
 run; where it is near the number of cores or above, other work took its share, and the figures say little but the
-ratios within one run. On a CPU nothing is uploaded. Rows that are not measured wait for such a device.
+ratios within one run. On a CPU nothing is uploaded. On a GPU parts are timed by events while the step waits in the
+device's queue, so that they are kernels and not launches.
+"""
+
+
+NOT_AT_HAND = """
+**No {} was at hand: these rows are empty.** What runs on one was built and tested without it: kernels through Triton's
+interpreter and compiled for sm_80 and sm_90, capture and streams by their order alone.
 """
 
 
@@ -99,7 +108,16 @@ def details(cell: Cell) -> str:
         f"{result['views']} views, {result['faces']:,} faces, texture {result['texture']}², {result['texels']:,} texels"
     )
     made = f"{cell['date']}, load {result['load']}; {limits}; {scene}\n\n    {cell['command']}\n\n"
-    return f"\n## {title}\n\n{made}" + markdown_table(["", "ms", "GFLOP", "MB", "floor, ms", "ratio"], rows)
+    text = f"\n## {title}\n\n{made}" + markdown_table(["", "ms", "GFLOP", "MB", "floor, ms", "ratio"], rows)
+    profile = result.get("profile")  # runs before it was taken have none
+    if profile is None:
+        return text
+    share = profile["busy_ms"] / result["step_ms"]
+    said = f"\nOperations of a step, by torch's profiler ({profile['busy_ms']} ms, {share:.2f} of the step above):\n\n"
+    operations = [
+        [f"`{row['name']}`", *(f"{row[key]:.4g}" for key in ("ms", "calls", "share"))] for row in profile["operations"]
+    ]
+    return text + said + markdown_table(["", "ms", "calls", "share"], operations)
 
 
 def main(line: list[str] | None = None) -> None:

@@ -52,6 +52,7 @@ def result(device: str, load: float) -> dict[str, Any]:
         "copy_gb_per_second": 8.5,
         "parts": {"draw and reproject": row},
         "stages": {"view maps": row, "decode": {"ms": 3.0}, "atlas": {"skipped": "making charts needs xatlas"}},
+        "profile": {"busy_ms": 61.7, "operations": [{"name": "conv", "ms": 30.5, "calls": 15.0, "share": 0.494}]},
     }
 
 
@@ -77,7 +78,10 @@ def test_rows_are_added_and_gpu_rows_stay_empty_until_measured(
         in page
     )
     assert "| - | NVIDIA H200 | not measured |" in page
+    assert "No NVIDIA H200 was at hand" in page
     assert "| view maps | 12.5 | 2 | 30 | 5 | 2.5 |" in page
+    assert "(61.7 ms, 0.50 of the step above)" in page
+    assert "| `conv` | 30.5 | 15 | 0.494 |" in page
     assert "| decode | 3 | - | - | - | - |" in page
     assert "| atlas | left out | - | - | - | - |" in page
     table.main(line)
@@ -85,6 +89,7 @@ def test_rows_are_added_and_gpu_rows_stay_empty_until_measured(
     page = (tmp_path / "bench.md").read_text()
     assert "CPU, 2 threads" in page
     assert "not measured |" not in page
+    assert "at hand" not in page
 
 
 def test_the_bench_is_run_as_anyone_would_and_its_line_kept(table: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,13 +6,15 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from advtex_engine import bench as bench_module
-from advtex_engine import bench_limits, bench_stages
+from advtex_engine import bench_limits, bench_profile, bench_stages
 from advtex_engine.__main__ import main
 from advtex_engine.bench_counts import ADAM_BYTES, PARAMETERS, Work, layer_sizes, step_flops, step_parts
 from advtex_engine.bench_limits import Limits, least_seconds, measure_limits
@@ -80,6 +82,36 @@ def test_a_step_its_parts_and_the_stages_are_timed_beside_their_floors(capsys: p
         floor = parts[name]["gflop"] / limits[0] * 1e3 + parts[name]["mb"] / limits[1]
         assert parts[name]["floor_ms"] == pytest.approx(floor, rel=0.05)
     assert all(stages[name]["ms"] > 0 for name in BY_LIBRARIES)
+    operations = result["profile"]["operations"]
+    assert len(operations) == 12
+    assert [row["ms"] for row in operations] == sorted((row["ms"] for row in operations), reverse=True)
+    assert 0.5 < sum(row["share"] for row in operations) <= 1.001
+    assert any("convolution_backward" in row["name"] and row["calls"] >= 5 for row in operations)
+    assert 0 < result["profile"]["busy_ms"] < 10_000
+
+
+def test_of_a_gpu_only_kernels_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    def row(kind: str, name: str, device_us: float, cpu_us: float, count: int) -> SimpleNamespace:
+        return SimpleNamespace(
+            device_type=SimpleNamespace(name=kind),
+            key=name,
+            self_device_time_total=device_us,
+            self_cpu_time_total=cpu_us,
+            count=count,
+        )
+
+    rows = [row("CUDA", "wgrad" * 30, 3000.0, 0.0, 20), row("CUDA", "adam", 1000.0, 0.0, 40)]
+    rows.append(row("CPU", "cudaGraphLaunch", 0.0, 9000.0, 1))
+    recorded = nullcontext(SimpleNamespace(key_averages=lambda: rows))
+    monkeypatch.setattr(bench_profile, "profile", lambda **_: recorded)
+    monkeypatch.setattr(bench_profile, "wait_for", lambda _: None)
+    stepper = SimpleNamespace(optimizer=SimpleNamespace(device=torch.device("cuda")), take=lambda _: 20)
+    found = bench_profile.profile_steps(stepper, 5)  # type: ignore[arg-type]
+    assert found["busy_ms"] == 0.2  # of 20 steps
+    assert [(len(one["name"]), one["calls"], one["ms"], one["share"]) for one in found["operations"]] == [
+        (100, 1, 0.15, 0.75),
+        (4, 2, 0.05, 0.25),
+    ]
 
 
 def test_torch_and_numpy_are_enough(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from advtex_engine.batches import Batch
 from advtex_engine.bench_counts import Work, step_flops, step_parts
 from advtex_engine.bench_limits import Limits, measure_limits
 from advtex_engine.bench_options import FACES, VIEWS, add_bench_options
+from advtex_engine.bench_profile import profile_steps
 from advtex_engine.bench_scene import made_scene
 from advtex_engine.bench_stages import Stage, time_stages
 from advtex_engine.config import PRESETS, Preset
@@ -37,7 +38,9 @@ from advtex_engine.views import Pairs, ViewMaps
 
 WARMUP, STEPS = 5, 30
 WARM_LAUNCHES, LAUNCHES = 2, 3  # of many steps each, where there are such; the fewest that are timed
+PROFILED = 5  # at least so many steps
 MANY = 1_000_000
+SLEEP_CYCLES = 50_000_000  # 25 ms and more, in which the host queues all kernels of a step
 
 
 class _Full(AdversarialOptimizer):
@@ -49,16 +52,36 @@ class _Full(AdversarialOptimizer):
 
 
 class _Timed(_Full):
-    """Waits for the device after each part and adds up its seconds."""
+    """Adds up the seconds of each part.
+
+    On a GPU a whole step is queued while the device sleeps, so that a part's seconds are those of its kernels, one
+    after the other as in a graph, and not of their launches.
+    """
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self.seconds: dict[str, float] = defaultdict(float)
+        self._events = list[tuple[str, torch.cuda.Event, torch.cuda.Event]]()
+
+    def step(self) -> None:
+        if self.device.type == "cuda":
+            torch.cuda._sleep(SLEEP_CYCLES)  # type: ignore[no-untyped-call]
+        super().step()
+        wait_for(self.device)
+        for name, began, ended in self._events:
+            self.seconds[name] += began.elapsed_time(ended) / 1e3
+        self._events.clear()
 
     def _time(self, name: str, part: Callable[..., Any], *args: Any) -> Any:
+        if self.device.type == "cuda":
+            began, ended = (torch.cuda.Event(enable_timing=True) for _ in range(2))  # type: ignore[no-untyped-call]
+            began.record()
+            result = part(*args)
+            ended.record()
+            self._events.append((name, began, ended))
+            return result
         started = time.perf_counter()
         result = part(*args)
-        wait_for(self.device)
         self.seconds[name] += time.perf_counter() - started
         return result
 
@@ -100,6 +123,7 @@ def bench(
         if index == WARMUP:
             timed.seconds.clear()
         timed.step()
+    profiled = profile_steps(stepper, PROFILED)
     works = step_parts(*plain.crop, maps.slots, 2 if plain.bfloat16 else 4)
     least, median = min(times), sorted(times)[len(times) // 2]
     flops = step_flops(*plain.crop)
@@ -135,6 +159,7 @@ def bench(
             for name, seconds in timed.seconds.items()
         },
         "stages": {name: _stage_row(stage, limits) for name, stage in stages.items()},
+        "profile": profiled,
     }
 
 
@@ -180,7 +205,7 @@ def print_table(result: dict[str, Any]) -> None:
     whole, crop = ("x".join(map(str, size)) for size in ((result["width"], result["height"]), result["crop"]))
     print(f"preset {result['preset']}, crops of {crop} from full frames of {whole}")
     for key, value in result.items():
-        if key not in ("preset", "width", "height", "crop", "parts", "stages"):
+        if key not in ("preset", "width", "height", "crop", "parts", "stages", "profile"):
             print(f"{key:36} {value}")
     for table, title in (("parts", "part of a step"), ("stages", "stage")):
         print(f"\n{title:36} {'ms':>10} {'GFLOP':>10} {'MB':>10} {'floor ms':>10} {'ratio':>8}")
@@ -194,6 +219,9 @@ def print_table(result: dict[str, Any]) -> None:
                 + " ".join(f"{cell:>10}" for cell in cells)
                 + f" {row.get('ratio', '-'):>8}"
             )
+    print(f"\n{'operation':36} {'ms':>10} {'calls':>10} {'share':>10}   of {result['profile']['busy_ms']} ms per step")
+    for row in result["profile"]["operations"]:
+        print(f"{row['name']:36} {row['ms']:10} {row['calls']:10} {row['share']:10}")
 
 
 def full_optimizer(maps: ViewMaps, pairs: Pairs, preset: Preset) -> AdversarialOptimizer:

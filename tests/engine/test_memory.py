@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,6 +26,7 @@ from advtex_engine.memory import Workload, available_memory, estimate, tensor_by
 from advtex_engine.optimize import AdversarialOptimizer
 from advtex_engine.planar import planar_views
 from advtex_engine.shortage import memory_problem
+from advtex_engine.synthesize import synthesize
 from advtex_engine.views import ViewMaps
 from advtex_store.needs import needed_memory
 
@@ -91,6 +95,33 @@ def test_the_estimate_of_steps_is_what_they_take(
 
     parts = estimate(workload(maps, PRESETS[preset], bfloat16=bfloat16))
     assert sum(parts[name] for name in OF_STEPS) == pytest.approx(most_alive(steps), rel=0.15)
+
+
+RUN = """
+import json, sys
+from pathlib import Path
+from advtex_engine.config import TextureConfig
+from advtex_engine.pipeline import texture_scan
+scan, folder, preset = sys.argv[1:]
+config = TextureConfig(preset=preset, steps=8, device="cpu")
+print(json.dumps(texture_scan(Path(scan), Path(folder), config, work=Path(folder) / "work").report["memory"]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["standard", "paper"])
+def test_a_whole_run_uses_what_was_estimated(preset: str, tmp_path: Path) -> None:
+    """Within 15 %; in a process of its own, since one that has done other work has its libraries already."""
+    synthesize(tmp_path / "scan", views=16, width=640, height=480)
+    done = subprocess.run(
+        [sys.executable, "-c", RUN, str(tmp_path / "scan"), str(tmp_path / "out"), preset],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
+    memory = json.loads(done.stdout.splitlines()[-1])
+    assert memory["measures"] == []
+    assert memory["used_bytes"] == pytest.approx(memory["estimated_bytes"], rel=0.15)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU")

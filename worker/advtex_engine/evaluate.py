@@ -22,6 +22,7 @@ from advtex_engine.errors import EngineError, Problem, ScanError
 from advtex_engine.export import TO_Y_UP
 from advtex_engine.files import write_atomically
 from advtex_engine.ingest import load_scene
+from advtex_engine.memory import available_memory
 from advtex_engine.metrics import METRICS, nearest_patch_loss
 from advtex_engine.models import load_model, load_reference
 from advtex_engine.monitor import Monitor
@@ -31,6 +32,7 @@ from advtex_engine.rasterize import rasterize
 from advtex_engine.refine_heldout import refine_heldout
 from advtex_engine.scene import Atlas, Fragments, Mesh, Scene, View
 from advtex_engine.sharpness import band_error, flat_energy, s3_ratio
+from advtex_engine.threads import in_threads, one_thread_each
 from advtex_scan.archive import open_scan
 from advtex_scan.check import read_scan
 from advtex_scan.errors import Finding, ScanFormatError
@@ -44,6 +46,8 @@ PATCH_QUERIES = 1000
 TEXELS_PER_SAMPLE, MIN_SUPERSAMPLE, MAX_SUPERSAMPLE = 1.5, 2, 6
 """A pixel is sampled so finely that neighboring samples lie this far apart in the texture, within these bounds."""
 SHEET_VIEWS = 12
+# What the patches of a view take while it is scored, and all else by its size; 300 MB were seen at 640x480.
+BYTES_PER_SCORED_VIEW, BYTES_PER_SCORED_PIXEL = 270 << 20, 400
 
 Metric = Callable[[Tensor, Tensor, Tensor], float]
 
@@ -192,9 +196,21 @@ def mean_scores(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def score_views(atlas: Atlas, texture: Tensor, views: Sequence[View], lpips: Lpips | None) -> dict[str, Any]:
-    """Means over views of a model on the scan's own mesh, without the costly nearest patches; empty if none counts."""
-    found = (compare(atlas, texture, view) for view in views)
-    rows = [score(comparison, lpips, VIEW_METRICS) for comparison in found if comparison is not None]
+    """Means over views of a model on the scan's own mesh, without the costly nearest patches; empty if none counts.
+
+    On the CPU, where the same model has the same scores on every machine; as many views side by side as there are
+    threads and room, since most of a view's work is of one thread.
+    """
+
+    def scored(view: View) -> Scores | None:
+        comparison = compare(atlas, texture, view)
+        return None if comparison is None else score(comparison, lpips, VIEW_METRICS)
+
+    pixels = max((view.camera.width * view.camera.height for view in views), default=1)
+    room = available_memory(torch.device("cpu")) // 2
+    at_once = min(torch.get_num_threads(), room // (BYTES_PER_SCORED_VIEW + BYTES_PER_SCORED_PIXEL * pixels))
+    with one_thread_each():
+        rows = [row for row in in_threads(scored, views, max(1, at_once)) if row is not None]
     return mean_scores(rows) if rows else {}
 
 

@@ -25,6 +25,7 @@ from advtex_engine.memory import (
     Workload,
     available_memory,
     estimate,
+    give_back_unused,
     limit_process,
     resident_memory,
     tensor_bytes,
@@ -132,6 +133,7 @@ class Budget:
 
     def begin(self) -> None:
         """The optimization begins: what the process has now is not its."""
+        give_back_unused()
         self._began = resident_memory()
 
     def report(self, work: Workload, record: Mapping[str, Any], held: int) -> dict[str, Any]:

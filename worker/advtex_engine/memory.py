@@ -8,9 +8,11 @@ allocator, as the bytes alive at the fullest moment of a step.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,13 +28,16 @@ SLOT = 4  # of a slot map
 LAYERS = ((64, 2), (128, 2), (128, 2), (128, 1), (1, 1))  # channels and strides of the discriminator
 PARAMETERS = 664_001
 SCHEDULED = 5 * FLOAT  # per step of the run, its row of the schedule
+# On a GPU, from torch's allocator: cuBLAS keeps 32 MiB on Hopper and 8 on others (torch's defaults); what cuDNN and
+# cuFFT ask for comes and goes. Not measured yet.
+WORKSPACES = 64 << 20
 CONTEXT = 500 << 20  # of CUDA and its libraries; no tensor, so not among those that torch's allocator counts
 # Per pixel of the crop. With features the fullest moment is at the beginning of the texture's gradient, while examples
 # and footprints are still needed, without them in the discriminator's gradient.
 HELD_WITH_FEATURES, HELD = 78, 5
 SPREAD, SPREAD_PIXEL = 16, 6  # or it is where the texture's gradient is made: per texel, per pixel of the crop
 CONVOLUTIONS = 360  # per pixel of the crop: what oneDNN keeps by itself, on a CPU
-LIBRARIES = 124 << 20  # on a CPU: code, tables and threads of what steps are the first to use; 100 to 155 were seen
+LIBRARIES = 174 << 20  # on a CPU: code, tables and threads of what steps are the first to use; 158 to 197 were seen
 FILLING = 79  # per texel of a dense texture that is made from a compact one
 SPLATTING = 240  # per pixel of a view that is averaged into the mean texture
 VGG_PIXEL = 10_000  # per pixel of the crop of its features' network, both examples
@@ -96,6 +101,8 @@ def estimate(work: Workload, on_device: int | None = None) -> dict[str, int]:
     }
     if work.device == "cuda":
         parts["context"] = CONTEXT
+        if work.plays:
+            parts["workspaces"] = WORKSPACES
     elif work.plays:
         parts["convolutions"] = CONVOLUTIONS * work.crop[0] * work.crop[1]
         parts["libraries"] = LIBRARIES
@@ -152,6 +159,15 @@ def resident_memory() -> int | None:
     if sys.platform != "linux":
         return None
     return _field(Path("/proc/self/status").read_text(), "VmRSS:") * 1024
+
+
+def give_back_unused() -> None:
+    """Of the host's memory what the C library keeps although it was freed: it would count as this process's.
+
+    Only glibc has a call for it; elsewhere nothing is done.
+    """
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def held_bytes(maps: Iterable[ViewMaps], device: torch.device) -> int:

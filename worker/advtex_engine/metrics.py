@@ -130,11 +130,11 @@ def sliced_wasserstein(image: Tensor, truth: Tensor, mask: Tensor | None = None,
     generator = torch.Generator().manual_seed(seed)
     directions = torch.randn(PATCH * PATCH * 3, PROJECTIONS, generator=generator).to(image.device)
     directions = directions / directions.norm(dim=0)
-    # NumPy sorts float32 ten times as fast as torch on a CPU.
-    ordered = [
-        np.sort((directions.T @ _patches(picture, corners).T).cpu().numpy(), axis=1) for picture in (image, truth)
-    ]
-    return float(np.abs(ordered[0] - ordered[1]).mean())
+    ours, theirs = ((directions.T @ _patches(picture, corners).T).cpu().numpy() for picture in (image, truth))
+    for values in (ours, theirs):  # NumPy sorts float32 ten times as fast as torch on a CPU
+        values.sort(axis=1)
+    ours -= theirs
+    return float(np.abs(ours, out=ours).mean())
 
 
 METRICS = {

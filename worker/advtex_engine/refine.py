@@ -31,7 +31,7 @@ from advtex_engine.refine_pose import keep_gauge, look, refine_poses
 from advtex_engine.refine_sight import CONTRAST_SCALE, Sight, look_at, motion
 from advtex_engine.registration import register_camera
 from advtex_engine.scene import Camera, DepthFrame, Mesh, Scene, View
-from advtex_engine.threads import in_threads
+from advtex_engine.threads import in_threads, one_thread_each
 
 COLOR_SCALE = 0.1  # disagreements beyond twice that are highlights
 DEVICE_POINTS = 1250  # per view
@@ -114,14 +114,17 @@ def apply_refinement(scene: Scene, refinement: Refinement) -> Scene:
     if refinement.lens is not None and refinement.device_offset is not None:
         common = Device(refinement.lens, refinement.device_offset)
         given, heldout = (tuple(_on_device(view, common) for view in part) for part in (given, heldout))
-    views = []
-    for view, pose, gain, offset in zip(
-        given, refinement.world_to_camera, refinement.gain, refinement.offset, strict=True
-    ):
+
+    def refined(one: tuple[View, Tensor, Tensor, Tensor]) -> View:
+        view, pose, gain, offset = one
         color = corrected_color(view.color.to(torch.float32) / 255, gain, offset)
         camera = replace(view.camera, world_to_camera=pose)
-        views.append(replace(view, camera=camera, color=(color * 255).round().to(torch.uint8)))
-    return replace(scene, views=tuple(views), heldout=heldout)
+        return replace(view, camera=camera, color=(color * 255).round().to(torch.uint8))
+
+    found = (refinement.world_to_camera, refinement.gain, refinement.offset)
+    with one_thread_each():
+        views = tuple(in_threads(refined, zip(given, *found, strict=True)))
+    return replace(scene, views=views, heldout=heldout)
 
 
 def _unmoved(scene: Scene) -> Refinement:

@@ -127,7 +127,7 @@ class FrameStore:
     def _write(self, array: Tensor) -> _Stored:
         stored = _Stored(self._end, tuple(array.shape), array.dtype)
         self._file.seek(self._end)
-        self._end += self._file.write(np.ascontiguousarray(array.numpy()).tobytes())
+        self._end += self._file.write(np.ascontiguousarray(array.numpy()).reshape(-1).view(np.uint8).data)
         return stored
 
     def _read(self, stored: _Stored, into: Tensor | None = None) -> Tensor:

@@ -18,6 +18,7 @@ from advtex_engine.rasterize import rasterize_views
 from advtex_engine.reproject import seen_share, unproject_pixels
 from advtex_engine.scene import Atlas, View
 from advtex_engine.texture import encode_uv, number_slots, touched_slots
+from advtex_engine.uploads import uploaded
 
 DEPTH_TOLERANCE = {"object": 0.03, "scene": 0.1}  # theta_z, metres (paper section 3.3)
 BYTES_PER_PIXEL = 9
@@ -120,13 +121,13 @@ def build_view_maps(atlas: Atlas, views: tuple[View, ...], kind: str, allocate: 
     depth = allocate((count, pixels), torch.float16)
     touched = torch.zeros((atlas.height, atlas.width), dtype=torch.bool, device=device)
     rasterized = rasterize_views(mesh, [view.camera for view in views])
-    for index, (view, fragments) in enumerate(zip(views, rasterized, strict=True)):
+    there = uploaded(views, device, with_color=color.device == device)
+    for index, (view, fragments) in enumerate(zip(there, rasterized, strict=True)):
         hit = fragments.face_index >= 0
         if view.depth is not None:
-            measured = view.depth.to(device)
-            hit = hit & ((measured == 0) | ((measured - fragments.depth).abs() < tolerance))
+            hit = hit & ((view.depth == 0) | ((view.depth - fragments.depth).abs() < tolerance))
         if view.mask is not None:
-            hit = hit & view.mask.to(device)
+            hit = hit & view.mask
         corners = mesh.v_uv[mesh.t_uv_idx[fragments.face_index.clamp(min=0).long()]]
         color[index] = view.color.view(-1, 3)
         uv[index] = encode_uv((corners * fragments.barycentric[..., None]).sum(2)).view(-1, 2)

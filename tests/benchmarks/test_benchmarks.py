@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import compiled
 import discriminator
 import harness
 import parts
@@ -178,3 +179,24 @@ def test_methods_are_compared_on_a_scan(tmp_path: Path, weights: Path, monkeypat
 
     monkeypatch.setattr(scans, "prepare", lambda *_: pytest.fail("every cell is there already"))
     scans.main(line)
+
+
+def test_compiled_steps_are_timed_beside_the_plain_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(_: object) -> None:
+        raise RuntimeError("no compiler\nand more")
+
+    def cannot(optimizer: Any) -> None:
+        optimizer.play = broken
+
+    monkeypatch.setattr(compiled, "FORMS", {"nothing": compiled.FORMS["nothing"], "play": cannot})
+    monkeypatch.setattr(compiled, "FACES", 600)
+    monkeypatch.setattr(compiled, "VIEWS", 4)
+    line = ["--device", "cpu", "--sizes", "96x72", "--presets", "paper", "--results", str(tmp_path)]
+    compiled.main(line)
+    rows = [
+        row.split(" | ") for row in (tmp_path / "compiled.md").read_text().splitlines() if row.startswith("| 96x72")
+    ]
+    assert [row[2] for row in rows] == ["nothing", "play"]
+    assert rows[0][-1] == "1.00 |"
+    assert float(rows[0][4]) >= float(rows[0][5]) > 0
+    assert rows[1][3] == "failed: no compiler"

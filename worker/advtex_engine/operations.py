@@ -1,7 +1,8 @@
 """The parts of a step that have a fast form for a GPU, behind one set of signatures; chosen once, at the start.
 
 The plain ones are torch and run everywhere. The fused ones are Triton's and need CUDA, the package `triton` and a C
-compiler, with which Triton builds its launchers.
+compiler, with which Triton builds its launchers. On a CPU torch.compile makes steps longer, by 2 to 50 %
+(`tests/benchmarks/compiled.py`).
 """
 
 from __future__ import annotations

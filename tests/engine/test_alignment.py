@@ -6,7 +6,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from advtex_engine.alignment import BLOCK, DETAIL, _box_mean, block_offsets, search_bound, shift
+from advtex_engine.alignment import BLOCK, DETAIL, block_offsets, box_mean, search_bound, shift
 
 BOUND = 5
 
@@ -75,7 +75,7 @@ def test_the_bound_follows_the_views_width() -> None:
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_the_box_mean_is_average_pooling_to_the_last_bit(dim: int) -> None:
+def test_thebox_mean_is_average_pooling_to_the_last_bit(dim: int) -> None:
     images = torch.rand(3, 1, 40, 50, generator=torch.Generator().manual_seed(0))
     along, padding = ((DETAIL, 1), (DETAIL // 2, 0)) if dim == 2 else ((1, DETAIL), (0, DETAIL // 2))
-    assert torch.equal(_box_mean(images, dim), F.avg_pool2d(images, along, 1, padding))
+    assert torch.equal(box_mean(images, dim), F.avg_pool2d(images, along, 1, padding))

@@ -9,12 +9,13 @@ import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from advtex_engine import examples, losses, texture
+from advtex_engine import alignment, examples, losses, texture
 from advtex_engine.alignment import BLOCK
 from advtex_engine.batches import PairSampler
 from advtex_engine.config import PRESETS, Preset
@@ -23,9 +24,12 @@ from advtex_engine.examples import InputForm
 from advtex_engine.operations import choose_operations, plain_operations
 from advtex_engine.optimize import AdversarialOptimizer
 from advtex_engine.planar import planar_views
+from advtex_engine.threads import one_thread_each
 from advtex_engine.views import ViewMaps
 
 pytest.importorskip("triton")
+fused_losses: Any = importlib.import_module("advtex_engine.fused_losses")
+fused_offsets: Any = importlib.import_module("advtex_engine.fused_offsets")
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
@@ -35,6 +39,7 @@ def fused() -> ModuleType:
     if DEVICE.type == "cpu":
         # The interpreter's time is one per program.
         module.BLOCK, module.LONG_BLOCK = 4096, 1 << 17  # type: ignore[attr-defined]
+        fused_losses.BLOCK, fused_losses.LONG_BLOCK, fused_offsets.BLOCK = 4096, 1 << 17, 4096
     return module
 
 
@@ -140,12 +145,97 @@ def test_inputs_are_rounded_to_bfloat16_once(fused: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_the_mean_difference_is_torchs(fused: ModuleType, dtype: torch.dtype) -> None:
+def test_the_mean_difference_is_torchs(monkeypatch: pytest.MonkeyPatch, dtype: torch.dtype) -> None:
+    monkeypatch.setattr(fused_losses, "LONG_BLOCK", 1024)
+    monkeypatch.setattr(fused_losses, "ALONE", 16)
     a, b = (image(64, 20, 30, number).to(dtype) for number in range(2))
     b[:, :, :4] = a[:, :, :4]  # nothing pulls where they are the same
     ours, plain = a.clone().requires_grad_(), a.clone().requires_grad_()
-    first, second = fused.mean_difference(ours, b), losses.mean_difference(plain, b)
+    first, second = fused_losses.mean_difference(ours, b), losses.mean_difference(plain, b)
     torch.testing.assert_close(first, second, atol=1e-5, rtol=2e-3)
+    (3 * first).backward()
+    (3 * second).backward()
+    assert ours.grad is not None and bool((ours.grad[:, :, :4] == 0).all())
+    torch.testing.assert_close(ours.grad, plain.grad)
+
+
+def test_offsets_are_found_as_by_torch() -> None:
+    """Of examples that are shifted, that are noise, and that are hardly visible, block by block."""
+    height, width, bound = 3 * BLOCK // 2 + 9, 2 * BLOCK + 14, 5
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.rand((1, 3, height + 16, width + 16), generator=generator) * 2 - 1
+    condition = noise[:, :, 8:-8, 8:-8]
+    real, fake = noise[:, :, 5:-11, 10:-6].clone(), noise[:, :, 8:-8, 6:-10].clone()
+    fake[..., width // 2 :] = torch.rand(fake[..., width // 2 :].shape, generator=generator) * 2 - 1
+    visible = torch.ones((1, 1, height, width))
+    visible[..., :BLOCK, :BLOCK] = torch.rand((1, 1, BLOCK, BLOCK), generator=generator) < 0.5
+    images = [one.contiguous(memory_format=torch.channels_last).to(DEVICE) for one in (condition, real, fake, visible)]
+    ours = fused_offsets.example_offsets(*images, bound)
+    plain = alignment.example_offsets(*images, bound)
+    assert plain.shape == (2, 2, 3, 2)
+    assert plain[0, 1, 2].tolist() == [-2, 3]
+    assert plain[1, 1, 0].tolist() == [2, 0]
+    assert plain[1, 1, 2].tolist() == plain[0, 0, 0].tolist() == [0, 0]
+    torch.testing.assert_close(ours, plain)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("pretraining", [0.0, 1.0])
+def test_the_players_are_judged_as_by_torch(
+    monkeypatch: pytest.MonkeyPatch, dtype: torch.dtype, pretraining: float
+) -> None:
+    monkeypatch.setattr(fused_losses, "ALONE", 128)  # several rounds
+    generator = torch.Generator().manual_seed(0)
+    waits = torch.tensor([7.0, pretraining], device=DEVICE)[1]
+    shares = torch.rand((1, 2, 17, 23), generator=generator).to(DEVICE) * torch.tensor([1.0, 0.7]).view(1, 2, 1, 1).to(
+        DEVICE
+    )
+    shares[:, 0, :5] *= 0.15
+    for strength in (0.1, 30.0):  # the texture is ahead, and the discriminator
+        logits = strength * (torch.rand((2, 17, 23), generator=generator).to(DEVICE) - 0.5)
+        logits += strength * torch.tensor([0.6, -0.6], device=DEVICE).view(2, 1, 1)
+        pairs = [[one[None, None].to(dtype).requires_grad_() for one in logits] for _ in range(2)]
+        ours, plain = fused_losses.judge(*pairs[0], shares, waits), losses.judge(*pairs[1], shares, waits)
+        for name in ("discriminator", "adversarial", "ahead"):
+            torch.testing.assert_close(getattr(ours, name), getattr(plain, name), atol=1e-5, rtol=1e-5)
+        assert float(plain.ahead) == (strength > 1) * (1 - pretraining)
+        for name in ("discriminator", "adversarial"):
+            found, wanted = (
+                torch.autograd.grad(3 * getattr(of, name), pair, retain_graph=True, allow_unused=True)
+                for of, pair in ((ours, pairs[0]), (plain, pairs[1]))
+            )
+            for a, b in zip(found, wanted, strict=True):
+                assert (a is None) == (b is None)
+                if a is not None and b is not None:
+                    assert float(b.abs().max()) > 0
+                    torch.testing.assert_close(a, b, atol=1e-6, rtol=1e-5 if dtype == torch.float32 else 0.008)
+        both = [
+            torch.autograd.grad(of.discriminator + 2 * of.adversarial, pair)
+            for of, pair in ((ours, pairs[0]), (plain, pairs[1]))
+        ]
+        torch.testing.assert_close(*both, atol=1e-6, rtol=1e-5 if dtype == torch.float32 else 0.016)
+
+
+def test_nothing_that_counts_costs_nothing() -> None:
+    logits = torch.randn((1, 1, 5, 7), generator=torch.Generator().manual_seed(0)).to(DEVICE).requires_grad_()
+    none = torch.zeros((1, 2, 5, 7), device=DEVICE)
+    verdict = fused_losses.judge(logits, logits * 2, none, torch.zeros((), device=DEVICE))
+    assert float(verdict.discriminator.detach()) == float(verdict.adversarial.detach()) == 0
+    (gradient,) = torch.autograd.grad(verdict.discriminator + verdict.adversarial, logits)
+    assert bool((gradient == 0).all())
+    images = image(3, 5, 7, 0), image(3, 5, 7, 1)
+    assert float(fused_losses.l1_loss(*images, torch.zeros((1, 1, 5, 7), device=DEVICE))) == 0
+
+
+def test_the_l1_loss_is_torchs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fused_losses, "BLOCK", 64)
+    monkeypatch.setattr(fused_losses, "ALONE", 16)
+    fake, real = image(3, 40, 30, 0), image(3, 40, 30, 1)
+    real[:, :, :4] = fake[:, :, :4]  # nothing pulls where they are the same
+    visible = (image(1, 40, 30, 2) > -0.5).float()
+    ours, plain = fake.clone().requires_grad_(), fake.clone().requires_grad_()
+    first, second = fused_losses.l1_loss(ours, real, visible), losses.l1_loss(plain, real, visible)
+    torch.testing.assert_close(first, second)
     (3 * first).backward()
     (3 * second).backward()
     assert ours.grad is not None and bool((ours.grad[:, :, :4] == 0).all())
@@ -206,11 +296,12 @@ def test_two_hundred_steps_on_the_kernels_end_like_those_on_torch(
     preset = dataclasses.replace(
         PRESETS["paper"], pretraining=20, averaging=50, lr_end=0.1, lr_discriminator=3e-4, max_crop=(32, 32)
     )
-    ours, plain = optimizer(fused, preset, 200), optimizer(None, preset, 200)
-    start = plain.values.detach().clone()
-    for _ in range(200):
-        ours.step()
-        plain.step()
+    with one_thread_each():  # how sums are cut into threads shows in their last digit, and then in the sign of an L1
+        ours, plain = optimizer(fused, preset, 200), optimizer(None, preset, 200)
+        start = plain.values.detach().clone()
+        for _ in range(200):
+            ours.step()
+            plain.step()
     assert float((plain.values - start).detach().abs().mean()) > 0.01, "the texture has gone somewhere"
     losses = plain.drain_losses()
     assert 0.05 < losses["skipped"] < 0.95, "both ways were taken"
@@ -235,7 +326,7 @@ COMPILE = """
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from advtex_engine import kernels
+from advtex_engine import kernels, kernels_losses, kernels_offsets
 
 TYPES = {
     "choose": "fp32 i64 i64 i64 i64 i64",
@@ -244,22 +335,35 @@ TYPES = {
     "sample_backward": "fp32 i32 fp32 fp32",
     "assemble": "fp32 fp32 fp32 fp32 fp32 bf16 bf16 fp32 fp32 fp32",
     "assemble_backward": "bf16 fp32 fp32 fp32 fp32",
+    "judge": "bf16 bf16 fp32 fp32 fp32 fp32 fp32 fp32",
+    "judge_backward": "bf16 bf16 fp32 fp32 fp32 fp32 bf16 bf16",
+    "l1": "fp32 fp32 fp32 fp32",
+    "l1_mean": "fp32 fp32 fp32",
+    "l1_backward": "fp32 fp32 fp32 fp32 fp32 fp32",
     "difference": "bf16 bf16 fp32",
+    "difference_mean": "fp32 fp32",
     "difference_backward": "bf16 bf16 fp32 bf16",
     "average": "fp32 fp32 fp32",
+    "luminance": "fp32 fp32 fp32 fp32 fp32",
+    "cut_blocks": "fp32 fp32 fp32 fp32 fp32",
+    "whiten": "fp32 fp32 fp32",
+    "find_peaks": "fp32 fp32 fp32 fp32",
 }
 SIZES = dict(
     COLUMNS=12, ROWS=12, FREE_X=65, FREE_Y=65, WIDTH=640, HEIGHT=480, CROP=576, PIXELS=576 * 416, TEXTURE_WIDTH=2048,
     TEXTURE_HEIGHT=2048, CHANNELS=8, CONDITIONED=True, MOVED=True, WITH_MOVED=True, COUNT=10**6, BLOCK=256,
+    JUDGED=True, DRAWN=True, PARTS=1000, SIDE=64, VALUES=10**6, BOUND=5, MIN_SEEN=0.6, MIN_CORRELATION=0.25,
+    MIN_GAIN=1.15,
 )
 # Not moved is how the published method's step runs; without a condition, its ablation; fp32, cards without bf16.
 OTHERS = {"assemble": ("MOVED", "CONDITIONED"), "assemble_backward": ("MOVED", "WITH_MOVED")}
+OTHERS |= {"judge_backward": ("JUDGED", "DRAWN")}
 variants = [(name, types, {}) for name, types in TYPES.items()]
 variants += [
     (name, TYPES[name].replace("bf16", "fp32"), {one: False}) for name, flags in OTHERS.items() for one in flags
 ]
 for name, types, off in variants:
-    kernel = getattr(kernels, name)
+    kernel = next(vars(module)[name] for module in (kernels, kernels_losses, kernels_offsets) if name in vars(module))
     signature = dict(zip(kernel.arg_names, ["*" + kind for kind in types.split()]))
     if name == "draw":
         signature["tolerance"] = "fp32"
@@ -283,4 +387,4 @@ def test_the_kernels_compile_for_gpus_that_are_not_here(tmp_path: Path, capabili
         [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=300, env=environment
     )
     assert done.returncode == 0, done.stderr
-    assert len(done.stdout.splitlines()) == 13
+    assert len(done.stdout.splitlines()) == 25

@@ -32,6 +32,11 @@ def search_bound(width: int) -> int:
     return max(2, round(width * SHARE_OF_WIDTH))
 
 
+def example_offsets(condition: Tensor, real: Tensor, fake: Tensor, visible: Tensor, bound: int) -> Tensor:
+    """`block_offsets` [2,gh,gw,2] of the real and the fake example [1,3,H,W] against the source image."""
+    return block_offsets(condition, torch.cat((real, fake.detach())), visible, bound)
+
+
 @torch.no_grad()
 def block_offsets(reference: Tensor, examples: Tensor, mask: Tensor, bound: int) -> Tensor:
     """Offsets [N,gh,gw,2] with examples(x + offset) ~ reference(x), for blocks every BLOCK / 2 pixels.
@@ -42,7 +47,7 @@ def block_offsets(reference: Tensor, examples: Tensor, mask: Tensor, bound: int)
     assert examples.shape[1:] == (3, height, width) and mask.shape == (1, 1, height, width)
     detail = _detail(torch.cat((reference, examples)), mask)
     blocks = detail.unfold(1, BLOCK, BLOCK // 2).unfold(2, BLOCK, BLOCK // 2)
-    spectrum = torch.fft.rfft2(blocks * _window(reference.device))
+    spectrum = torch.fft.rfft2(blocks * fading_window(reference.device))
     cross = spectrum[1:] * spectrum[:1].conj()
     strength = cross.abs()
     correlation = torch.fft.irfft2(cross / (strength.pow(WHITENING) + 1e-6), s=(BLOCK, BLOCK))
@@ -93,7 +98,7 @@ def move(images: Tensor, positions: Tensor) -> Tensor:
 
 
 @functools.cache
-def _window(device: torch.device) -> Tensor:
+def fading_window(device: torch.device) -> Tensor:
     """[BLOCK,BLOCK], which fades out towards the block's border."""
     window = torch.hann_window(BLOCK, periodic=False, device=device)
     square: Tensor = window[:, None] * window
@@ -111,11 +116,11 @@ def _detail(images: Tensor, mask: Tensor) -> Tensor:
     """Luminance without its local mean, 0 outside the mask [N,H,W]."""
     red, green, blue = images[:, :1], images[:, 1:2], images[:, 2:]
     luminance = (0.299 * red + 0.587 * green + 0.114 * blue) * mask
-    smooth = _box_mean(_box_mean(luminance, 2), 3)
+    smooth = box_mean(box_mean(luminance, 2), 3)
     return ((luminance - smooth) * mask)[:, 0]
 
 
-def _box_mean(images: Tensor, dim: int) -> Tensor:
+def box_mean(images: Tensor, dim: int) -> Tensor:
     """Means of [N,1,H,W] over DETAIL pixels along one side, zero beyond the border."""
     half = DETAIL // 2
     if images.is_cuda:

@@ -14,16 +14,29 @@ from advtex_engine import kernels
 from advtex_engine.alignment import BLOCK as OFFSET_BLOCK
 from advtex_engine.batches import Batch, Choice, PairSampler
 from advtex_engine.examples import Examples, InputForm
+from advtex_engine.fused_losses import judge, l1_loss, mean_difference
+from advtex_engine.fused_offsets import example_offsets
 from advtex_engine.operations import Operations
 
 BLOCK = 256  # pixels of a program
-LONG_BLOCK = 4096  # values of a program that only adds up or copies
+LONG_BLOCK = 4096  # values of a program that only copies
 
 assert kernels.GRID.value == OFFSET_BLOCK // 2
 
 
 def triton_operations() -> Operations:
-    return Operations("triton", None, draw, sample_texels, assemble, mean_difference, average)
+    return Operations(
+        "triton",
+        None,
+        draw=draw,
+        sample_texels=sample_texels,
+        offsets=example_offsets,
+        assemble=assemble,
+        judge=judge,
+        l1_loss=l1_loss,
+        mean_difference=mean_difference,
+        average=average,
+    )
 
 
 def draw(sampler: PairSampler) -> Batch:
@@ -170,33 +183,6 @@ def assemble(
     if moved:
         fake, real, visible = moved
     return Examples(fake_input, real_input, fake, real, visible)
-
-
-class _MeanDifference(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, a: Tensor, b: Tensor) -> Tensor:
-        ctx.save_for_backward(a, b)
-        programs = _programs(a.numel(), LONG_BLOCK)
-        sums = torch.empty(programs, device=a.device)
-        kernels.difference[programs](a, b, sums, COUNT=a.numel(), BLOCK=LONG_BLOCK)
-        return sums.sum() / a.numel()
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Any) -> tuple[Tensor, None]:
-        a, b = ctx.saved_tensors
-        into = torch.empty_like(a)
-        kernels.difference_backward[_programs(a.numel(), LONG_BLOCK)](
-            a, b, grads[0].contiguous(), into, COUNT=a.numel(), BLOCK=LONG_BLOCK
-        )
-        return into, None
-
-
-def mean_difference(a: Tensor, b: Tensor) -> Tensor:
-    """`losses.mean_difference`; both layers lie in memory as channels_last."""
-    assert a.shape == b.shape
-    a, b = (image.contiguous(memory_format=torch.channels_last) for image in (a, b.detach()))
-    mean: Tensor = _MeanDifference.apply(a, b)  # type: ignore[no-untyped-call]
-    return mean
 
 
 def average(mean: Tensor, state: Tensor, weight: Tensor) -> None:

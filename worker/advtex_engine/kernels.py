@@ -1,4 +1,4 @@
-"""Triton kernels of a step; `fused.py` launches them and names each one's plain twin in torch.
+"""Triton kernels of a step's images; `fused.py` launches them and names each one's plain twin in torch.
 
 One program does BLOCK pixels (or values). Rows [P,3] are colors of a crop of CROP pixels' width, row by row. Sizes are
 constants of a compiled kernel: a run has one of each. All images and textures have at least 2 x 2 pixels.
@@ -332,25 +332,6 @@ def assemble_backward(
                 tl.atomic_add(there, weight * gradient, mask=live & (weight * gradient != 0), sem="relaxed")
         else:
             tl.store(into + pixel * 3 + channel, gradient, mask=live)
-
-
-@triton.jit
-def difference(a, b, sums, COUNT: tl.constexpr, BLOCK: tl.constexpr):
-    """Sum of |a - b| over each block, float32."""
-    at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    live = at < COUNT
-    value = tl.load(a + at, mask=live, other=0.0).to(tl.float32) - tl.load(b + at, mask=live, other=0.0).to(tl.float32)
-    tl.store(sums + tl.program_id(0), tl.sum(tl.abs(value), 0))
-
-
-@triton.jit
-def difference_backward(a, b, gradient, into, COUNT: tl.constexpr, BLOCK: tl.constexpr):
-    """The mean's gradient times the sign of a - b."""
-    at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    live = at < COUNT
-    value = tl.load(a + at, mask=live, other=0.0).to(tl.float32) - tl.load(b + at, mask=live, other=0.0).to(tl.float32)
-    scale = tl.load(gradient) / COUNT
-    tl.store(into + at, tl.where(value > 0, scale, tl.where(value < 0, -scale, 0.0)), mask=live)
 
 
 @triton.jit

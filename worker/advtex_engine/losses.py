@@ -30,7 +30,15 @@ def patch_masks(foreground: Tensor, visible: Tensor) -> PatchMasks:
     foreground: [B,1,H,W], pixels where the source view sees the mesh. visible: [B,1,H,W], those of them that the
     auxiliary view sees as well.
     """
-    shares = patch_shares(torch.cat((foreground, visible), 1).to(torch.float32))
+    return _masks(example_shares(foreground, visible))
+
+
+def example_shares(foreground: Tensor, visible: Tensor) -> Tensor:
+    """What of each patch is foreground, and what of it is visible [B,2,h,w]; arguments as those of `patch_masks`."""
+    return patch_shares(torch.cat((foreground, visible), 1).to(torch.float32))
+
+
+def _masks(shares: Tensor) -> PatchMasks:
     inside, seen = shares[:, :1], shares[:, 1:]
     texture = (inside >= MIN_FOREGROUND).to(torch.float32)
     return PatchMasks(texture, texture * (seen > MIN_UNOCCLUDED * inside))
@@ -50,6 +58,27 @@ def discriminator_loss(real: Tensor, fake: Tensor, mask: Tensor) -> Tensor:
 def adversarial_loss(fake: Tensor, mask: Tensor) -> Tensor:
     """Non-saturating loss of the texture, -log D(fake), over the patches that count."""
     return masked_mean(F.softplus(-fake), mask)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """0-dim tensors: both players' losses, and 1 where the discriminator is ahead, else 0."""
+
+    discriminator: Tensor
+    adversarial: Tensor
+    ahead: Tensor
+
+
+def judge(real: Tensor, fake: Tensor, shares: Tensor, pretraining: Tensor) -> Verdict:
+    """Both losses of the logits [1,1,h,w] of any type. shares: `example_shares`. pretraining: 0-dim, 1 or 0.
+
+    The discriminator is ahead where its loss is not above the texture's; while it learns alone it never is.
+    """
+    masks, real, fake = _masks(shares), real.float(), fake.float()
+    of_discriminator = discriminator_loss(real, fake, masks.discriminator)
+    adversarial = adversarial_loss(fake, masks.texture)
+    ahead = (of_discriminator <= adversarial).to(torch.float32).detach() * (1 - pretraining)
+    return Verdict(of_discriminator, adversarial, ahead)
 
 
 def l1_loss(fake: Tensor, real: Tensor, visible: Tensor) -> Tensor:

@@ -15,9 +15,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from advtex_engine.alignment import example_offsets
 from advtex_engine.batches import Batch, PairSampler
 from advtex_engine.examples import Examples, InputForm, assemble
-from advtex_engine.losses import mean_difference
+from advtex_engine.losses import Verdict, judge, l1_loss, mean_difference
 from advtex_engine.texture import sample_texels
 
 
@@ -25,21 +26,36 @@ from advtex_engine.texture import sample_texels
 class Operations:
     """name: "torch" or "triton". reason: why not the other one; None for the better one.
 
-    draw: `PairSampler.draw`. sample_texels: `texture.sample_texels`. assemble: `examples.assemble`. mean_difference:
-    `losses.mean_difference`. average(mean, state, weight): mean += weight * (state - mean), weight 0-dim on the device.
+    draw: `PairSampler.draw`. sample_texels: `texture.sample_texels`. offsets: `alignment.example_offsets`. assemble:
+    `examples.assemble`. judge, l1_loss, mean_difference: those of `losses`. average(mean, state, weight): mean +=
+    weight * (state - mean), weight 0-dim on the device.
     """
 
     name: str
     reason: str | None
     draw: Callable[[PairSampler], Batch]
     sample_texels: Callable[[Tensor, Tensor, Tensor], Tensor]
+    offsets: Callable[[Tensor, Tensor, Tensor, Tensor, int], Tensor]
     assemble: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor | None, InputForm], Examples]
+    judge: Callable[[Tensor, Tensor, Tensor, Tensor], Verdict]
+    l1_loss: Callable[[Tensor, Tensor, Tensor], Tensor]
     mean_difference: Callable[[Tensor, Tensor], Tensor]
     average: Callable[[Tensor, Tensor, Tensor], object]
 
 
 def plain_operations(reason: str | None = None) -> Operations:
-    return Operations("torch", reason, PairSampler.draw, sample_texels, assemble, mean_difference, torch.Tensor.lerp_)
+    return Operations(
+        "torch",
+        reason,
+        draw=PairSampler.draw,
+        sample_texels=sample_texels,
+        offsets=example_offsets,
+        assemble=assemble,
+        judge=judge,
+        l1_loss=l1_loss,
+        mean_difference=mean_difference,
+        average=torch.Tensor.lerp_,
+    )
 
 
 def choose_operations(device: torch.device) -> Operations:

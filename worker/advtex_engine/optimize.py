@@ -22,13 +22,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advtex_engine.alignment import BLOCK, block_offsets, search_bound
+from advtex_engine.alignment import BLOCK, search_bound
 from advtex_engine.batches import Batch, PairSampler
 from advtex_engine.checkpoint import restore_generator
 from advtex_engine.config import Preset
 from advtex_engine.discriminator import MIN_SIZE, PatchDiscriminator
 from advtex_engine.examples import InputForm
-from advtex_engine.losses import adversarial_loss, discriminator_loss, feature_loss, l1_loss, patch_masks
+from advtex_engine.losses import example_shares, feature_loss
 from advtex_engine.operations import Operations, choose_operations, plain_operations
 from advtex_engine.schedule import Schedule
 from advtex_engine.shortage import memory_problem
@@ -175,27 +175,24 @@ class AdversarialOptimizer:
         fake = self._render(self.values, batch)
         offsets = self._offsets(batch, fake) if self.aligns else None
         shown = self.operations.assemble(batch.condition, batch.real, fake, batch.visible, offsets, self.form)
-        masks = patch_masks(batch.foreground, shown.visible)
         with self._autocast():
             fake_logits, of_fake = self.discriminator.examine(shown.fake_input)
             real_logits, of_real = self.discriminator.examine(shown.real_input)
-            fake_logits, real_logits = fake_logits.float(), real_logits.float()
-        of_discriminator = discriminator_loss(real_logits, fake_logits, masks.discriminator)
-        adversarial = adversarial_loss(fake_logits, masks.texture)
-        ahead = (of_discriminator <= adversarial).to(torch.float32).detach() * (1 - self.schedule.pretraining)
+        shares = example_shares(batch.foreground, shown.visible)
+        verdict = self.operations.judge(real_logits, fake_logits, shares, self.schedule.pretraining)
         if self.start is None:
-            l1 = l1_loss(shown.fake, shown.real, shown.visible)
+            l1 = self.operations.l1_loss(shown.fake, shown.real, shown.visible)
         else:
-            l1 = l1_loss(fake, self._render(self.start, batch), batch.visible)
+            l1 = self.operations.l1_loss(fake, self._render(self.start, batch), batch.visible)
         features = torch.zeros_like(l1)
         if self.preset.feature_weight:
             features = feature_loss(of_fake, of_real, self.operations.mean_difference)
-        return Losses(of_discriminator, adversarial, l1, features, ahead)
+        return Losses(verdict.discriminator, verdict.adversarial, l1, features, verdict.ahead)
 
     def _offsets(self, batch: Batch, fake: Tensor) -> Tensor:
         """Offsets [2,gh,gw,2] that move the real and the fake example onto the source."""
-        examples = torch.cat((batch.real, fake.detach()))
-        return block_offsets(batch.condition, examples, batch.visible, search_bound(self.maps.width))
+        bound = search_bound(self.maps.width)
+        return self.operations.offsets(batch.condition, batch.real, fake, batch.visible, bound)
 
     def _render(self, values: Tensor, batch: Batch) -> Tensor:
         """The compact texture seen by the source view, [1,3,h,w] in [-1,1]."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ from harness import (
 )
 from torch import Tensor, nn
 
-from advtex_engine.discriminator import PatchDiscriminator
+from advtex_engine.discriminator import STRIDES, PatchDiscriminator
 from advtex_engine.methods import MethodInput
 from advtex_engine.methods.mean import dense_texture
 from advtex_engine.optimize import AdversarialOptimizer
@@ -74,14 +74,15 @@ class SizedDiscriminator(PatchDiscriminator):
                 nn.init.zeros_(narrow.bias)
                 self.convolutions[index] = narrow
 
-    def examine(self, x: Tensor) -> tuple[Tensor, list[Tensor]]:
-        x, features = x[:, :6], list[Tensor]()  # a GPU's examples have two channels of zeros more
-        for index, layer in enumerate(self.convolutions):
-            assert isinstance(layer, nn.Conv2d)
+    def examine(self, x: Tensor, parameters: Sequence[Tensor] | None = None) -> tuple[Tensor, list[Tensor]]:
+        given = list(self.parameters() if parameters is None else parameters)
+        # A GPU's examples have two channels of zeros more.
+        x, features = x[:, :6].to(given[0].dtype), list[Tensor]()
+        for index, (weight, bias, stride) in enumerate(zip(given[::2], given[1::2], STRIDES, strict=True)):
             last = index >= 3
             dilation = self.dilation if last else 1
-            padding = dilation * (layer.kernel_size[0] - 1) // 2 if last else 1
-            x = F.conv2d(x, layer.weight, layer.bias, layer.stride, padding, dilation)
+            padding = dilation * (weight.shape[-1] - 1) // 2 if last else 1
+            x = F.conv2d(x, weight, bias, stride, padding, dilation)
             if index < 4:
                 x = F.leaky_relu(x, 0.2)
                 features.append(x)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -9,6 +11,7 @@ from torch import Tensor, nn
 RECEPTIVE_FIELD = 70
 PATCH_STRIDE = 8
 PATCH_OFFSET = -23  # the receptive field of logit (0, 0) starts this far outside the image
+STRIDES = (2, 2, 2, 1, 1)
 MIN_SIZE = 24  # pixels per side that give one logit
 
 
@@ -22,9 +25,8 @@ class PatchDiscriminator(nn.Module):
     def __init__(self, generator: torch.Generator | None = None) -> None:
         super().__init__()
         channels = (6, 64, 128, 128, 128, 1)
-        strides = (2, 2, 2, 1, 1)
         self.convolutions = nn.ModuleList(
-            nn.Conv2d(channels[i], channels[i + 1], 4, stride, padding=1) for i, stride in enumerate(strides)
+            nn.Conv2d(channels[i], channels[i + 1], 4, stride, padding=1) for i, stride in enumerate(STRIDES)
         )
         for layer in self.convolutions:
             assert isinstance(layer, nn.Conv2d) and layer.bias is not None
@@ -38,23 +40,23 @@ class PatchDiscriminator(nn.Module):
         assert condition.shape == residual.shape and condition.shape[1] == 3
         return self.examine(torch.cat((condition, residual), 1))[0]
 
-    def examine(self, x: Tensor) -> tuple[Tensor, list[Tensor]]:
+    def examine(self, x: Tensor, parameters: Sequence[Tensor] | None = None) -> tuple[Tensor, list[Tensor]]:
         """The logits as from `forward`, and what the four layers before them respond: [B,64|128,h,w] each.
 
-        x: [B,6,H,W], condition and residual; channels beyond them are met by weights of zero.
+        x: [B,6,H,W], condition and residual; channels beyond them are met by weights of zero. parameters: to be taken
+        in place of the own ones, in their order; their type is that of the arithmetic.
         """
         assert min(x.shape[-2:]) >= MIN_SIZE
-        x = x.contiguous(memory_format=torch.channels_last)
-        first, *middle, last = self.convolutions
-        assert isinstance(first, nn.Conv2d)
+        given = list(self.parameters() if parameters is None else parameters)
+        x = x.to(given[0].dtype).contiguous(memory_format=torch.channels_last)
         # Tensor cores want a multiple of 8 channels; the parameters stay those of 6.
-        weight = F.pad(first.weight, (0, 0, 0, 0, 0, x.shape[1] - 6)) if x.shape[1] > 6 else first.weight
-        x = F.leaky_relu(F.conv2d(x, weight, first.bias, first.stride, first.padding), 0.2, inplace=True)
-        features = [x]
-        for layer in middle:
-            x = F.leaky_relu(layer(x), 0.2, inplace=True)
+        if x.shape[1] > 6:
+            given[0] = F.pad(given[0], (0, 0, 0, 0, 0, x.shape[1] - 6))
+        features = []
+        for weight, bias, stride in zip(given[:-2:2], given[1:-2:2], STRIDES[:-1], strict=True):
+            x = F.leaky_relu(F.conv2d(x, weight, bias, stride, padding=1), 0.2, inplace=True)
             features.append(x)
-        return last(x), features
+        return F.conv2d(x, given[-2], given[-1], STRIDES[-1], padding=1), features
 
 
 def patch_shares(mask: Tensor) -> Tensor:

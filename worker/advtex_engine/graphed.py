@@ -1,7 +1,7 @@
 """Many steps per launch: a run of steps captured as one CUDA graph and replayed.
 
-A step of 300 kernels costs the host milliseconds and an H200 a fraction of one. The first steps are taken one by one on
-a side stream, as torch asks for before a capture (libraries set themselves up, no memory of theirs may come from the
+A step of 150 kernels costs the host a millisecond and an H200 a fraction of one. The first steps are taken one by one
+on a side stream, as torch asks for before a capture (libraries set themselves up, no memory of theirs may come from the
 graph's pool); they count like all others. Random numbers go on as they would without a graph: the generator is
 registered with it. Where nothing can be captured, steps are taken one by one.
 """

@@ -148,7 +148,8 @@ def _step(work: Workload) -> dict[str, int]:
     fullest = max(shown + held, SPREAD * work.slots + SPREAD_PIXEL * pixels)
     return {
         "compact_texture": (4 + beside) * TEXEL * work.slots,
-        "discriminator": (4 * FLOAT + (2 if work.bfloat16 else 0)) * PARAMETERS + SCHEDULED * preset.steps,
+        # Values, gradients, two moments; the gradients of either example, and what they are gradients of.
+        "discriminator": (4 * FLOAT + (3 if work.bfloat16 else 2) * size) * PARAMETERS + SCHEDULED * preset.steps,
         "activations": 2 * sum(activations(width, height, size)),
         "step": differences + fullest,
     }

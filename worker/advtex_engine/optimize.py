@@ -15,7 +15,6 @@ branch costs nothing, what is skipped is not computed.
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -100,6 +99,9 @@ class AdversarialOptimizer:
         self.parameters = list(discriminator.parameters())
         self.adam_texture = _adam([self.values], self.schedule.lr_texture, preset.beta1)
         self.adam_discriminator = _adam(self.parameters, self.schedule.lr_discriminator, preset.beta1)
+        self._gradients = [torch.zeros_like(parameter) for parameter in self.parameters]
+        for parameter, into in zip(self.parameters, self._gradients, strict=True):
+            parameter.grad = into
         self.bfloat16 = native_bfloat16(device)
         self.crop = crop_size(maps.width, maps.height, preset.max_crop)
         self.aligns = preset.alignment and min(self.crop) >= BLOCK
@@ -112,6 +114,21 @@ class AdversarialOptimizer:
         self._summed = 0
         if operations is None and self.operations.name != "torch":
             self._try_operations()
+
+    @property
+    def bfloat16(self) -> bool:
+        """Whether the discriminator computes in bfloat16; its parameters and their gradients are float32."""
+        return self._weights[0].dtype == torch.bfloat16
+
+    @bfloat16.setter
+    def bfloat16(self, half: bool) -> None:
+        dtype = torch.bfloat16 if half else torch.float32
+        self._own = [parameter.detach() for parameter in self.parameters]
+        self._weights = [parameter.to(dtype) for parameter in self._own]
+        # Leaves of their own for either example, of one memory: one kernel adds the gradients up, and not one for each.
+        self._of_fake, self._of_real = (
+            [weight.detach().requires_grad_() for weight in self._weights] for _ in range(2)
+        )
 
     @property
     def index(self) -> int:
@@ -175,9 +192,10 @@ class AdversarialOptimizer:
         fake = self._render(self.values, batch)
         offsets = self._offsets(batch, fake) if self.aligns else None
         shown = self.operations.assemble(batch.condition, batch.real, fake, batch.visible, offsets, self.form)
-        with self._autocast():
-            fake_logits, of_fake = self.discriminator.examine(shown.fake_input)
-            real_logits, of_real = self.discriminator.examine(shown.real_input)
+        if self.bfloat16:
+            torch._foreach_copy_(self._weights, self._own)
+        fake_logits, of_fake = self.discriminator.examine(shown.fake_input, self._of_fake)
+        real_logits, of_real = self.discriminator.examine(shown.real_input, self._of_real)
         shares = example_shares(batch.foreground, shown.visible)
         verdict = self.operations.judge(real_logits, fake_logits, shares, self.schedule.pretraining)
         if self.start is None:
@@ -226,11 +244,10 @@ class AdversarialOptimizer:
         """One step of Adam over the discriminator, unless it is ahead."""
         if self.branches and bool(losses.ahead):
             return
-        gradients = torch.autograd.grad(losses.discriminator, self.parameters)
-        for parameter, gradient in zip(self.parameters, gradients, strict=True):
-            # The fused kernels ignore strides, or refuse those that differ.
-            same = gradient.stride() == parameter.stride()
-            parameter.grad = gradient if same else torch.empty_like(parameter).copy_(gradient)
+        gradients = torch.autograd.grad(losses.discriminator, [*self._of_fake, *self._of_real])
+        of_fake, of_real = gradients[: len(self._weights)], gradients[len(self._weights) :]
+        torch._foreach_add_(of_fake, of_real)
+        torch._foreach_copy_(self._gradients, of_fake)
         if not self.branches:
             self.adam_discriminator.found_inf = losses.ahead  # type: ignore[attr-defined]  # the fused kernel's skip flag
         self.adam_discriminator.step()
@@ -274,11 +291,6 @@ class AdversarialOptimizer:
         _load_adam(self.adam_texture, state["adam_texture"])
         _load_adam(self.adam_discriminator, state["adam_discriminator"])
         restore_generator(self.generator, state["generator"], self.index)
-
-    def _autocast(self) -> contextlib.AbstractContextManager[Any]:
-        if not self.bfloat16:
-            return contextlib.nullcontext()
-        return torch.autocast(self.device.type, dtype=torch.bfloat16)
 
 
 def _adam(parameters: list[Any], lr: Tensor, beta1: float) -> torch.optim.Adam:

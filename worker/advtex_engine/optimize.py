@@ -148,8 +148,9 @@ class AdversarialOptimizer:
         """Takes the plain ones, with the reason, where the device's own fail in a step that changes nothing."""
         before = self.generator.get_state()
         try:
-            gradient = self.texture_gradient(self.play(self.draw()))
-            finite = bool(gradient.isfinite().all())
+            losses = self.play(self.draw())
+            gradients = [self.texture_gradient(losses), *self._discriminator_gradients(losses)]
+            finite = all(bool(gradient.isfinite().all()) for gradient in gradients)
         except Exception as error:
             if memory_problem(error) is not None:
                 raise
@@ -244,13 +245,17 @@ class AdversarialOptimizer:
         """One step of Adam over the discriminator, unless it is ahead."""
         if self.branches and bool(losses.ahead):
             return
-        gradients = torch.autograd.grad(losses.discriminator, [*self._of_fake, *self._of_real])
-        of_fake, of_real = gradients[: len(self._weights)], gradients[len(self._weights) :]
-        torch._foreach_add_(of_fake, of_real)
-        torch._foreach_copy_(self._gradients, of_fake)
+        torch._foreach_copy_(self._gradients, self._discriminator_gradients(losses))
         if not self.branches:
             self.adam_discriminator.found_inf = losses.ahead  # type: ignore[attr-defined]  # the fused kernel's skip flag
         self.adam_discriminator.step()
+
+    def _discriminator_gradients(self, losses: Losses) -> tuple[Tensor, ...]:
+        """One per parameter, in the type of the arithmetic."""
+        gradients = torch.autograd.grad(losses.discriminator, [*self._of_fake, *self._of_real])
+        of_fake, of_real = gradients[: len(self._weights)], gradients[len(self._weights) :]
+        torch._foreach_add_(of_fake, of_real)
+        return of_fake
 
     def drain_losses(self) -> dict[str, float]:
         """Means since the last call (waits for the device); empty when no step was taken."""

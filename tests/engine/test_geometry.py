@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import torch
@@ -12,6 +15,7 @@ from hypothesis import strategies as st
 from advtex_engine.errors import Problem, ScanError
 from advtex_engine.geometry import clean, decimate
 from advtex_engine.monitor import Monitor
+from advtex_engine.quadric import collapse_edges
 from advtex_engine.scene import Mesh
 
 
@@ -153,3 +157,19 @@ def test_decimation_says_that_uv_are_dropped() -> None:
     assert decimate(with_uv, 500, listener).v_uv is None
     assert [problem.code for problem in listener.warnings] == ["uv_dropped"]
     assert "1,280 faces" in listener.warnings[0].message
+
+
+def test_threads_that_collapse_at_the_same_time_do_not_mix_up_their_meshes() -> None:
+    """A scan's mesh is decimated while another of it is made coarse to judge its conventions."""
+    meshes = [sphere(3), sphere(4)] * 100
+    alone = [collapse_edges(mesh, 200) for mesh in meshes[:2]]
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            together = list(pool.map(lambda mesh: collapse_edges(mesh, 200), meshes))
+    finally:
+        sys.setswitchinterval(interval)
+    for number, collapsed in enumerate(together):
+        assert torch.equal(collapsed.v_pos, alone[number % 2].v_pos)
+        assert torch.equal(collapsed.t_pos_idx, alone[number % 2].t_pos_idx)

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
-import fast_simplification
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -30,6 +29,7 @@ from advtex_engine.decode import (
 )
 from advtex_engine.depth import DepthEncoding, Raw, declared_encoding, outside_mask
 from advtex_engine.frame_cameras import depth_camera, frame_camera, inverse_pose
+from advtex_engine.quadric import collapse_edges
 from advtex_engine.scene import Mesh
 from advtex_engine.video import VideoReader
 from advtex_scan.archive import ScanArchive
@@ -195,12 +195,7 @@ def _coarse(mesh: Mesh) -> Mesh:
     """The mesh with at most about MESH_FACES faces; borders and degenerate faces do not matter here."""
     if len(mesh.t_pos_idx) <= MESH_FACES:
         return Mesh(mesh.v_pos, mesh.t_pos_idx)
-    position, faces = fast_simplification.simplify(
-        np.ascontiguousarray(mesh.v_pos.numpy(), np.float32),
-        np.ascontiguousarray(mesh.t_pos_idx.numpy(), np.int32),
-        target_count=MESH_FACES,
-    )
-    return Mesh(torch.from_numpy(position.astype(np.float32)), torch.from_numpy(faces.astype(np.int64)))
+    return collapse_edges(mesh, MESH_FACES)
 
 
 def _intrinsics(cameras: Sequence[Intrinsics], size: tuple[int, int]) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ from sqlalchemy.pool import ConnectionPoolEntry
 POSTGRES_LINE = {"connect_timeout": 5, "tcp_user_timeout": 10_000, "keepalives_idle": 10, "keepalives_interval": 5}
 POSTGRES_LIMITS = "-c statement_timeout=30s -c lock_timeout=15s -c idle_in_transaction_session_timeout=20s"
 SQLITE_POOL = 40
+SQLITE_WAIT = 30  # seconds, for another connection's lock
 MIGRATION_LOCK = 0x61647674  # any constant that only this service uses as a PostgreSQL advisory lock
 
 
@@ -72,7 +74,7 @@ def connect(url: str, limits: str = "") -> Engine:
     if folder := make_url(url).database:
         Path(folder).parent.mkdir(parents=True, exist_ok=True)
     # As many as a server has threads: opening a connection takes longer than a request, and they cost little when idle.
-    engine = create_engine(url, pool_size=SQLITE_POOL, connect_args={"timeout": 30})
+    engine = create_engine(url, pool_size=SQLITE_POOL, connect_args={"timeout": SQLITE_WAIT})
     event.listen(engine, "connect", _prepare_sqlite)
     event.listen(engine, "begin", _begin_sqlite)
     return engine
@@ -84,8 +86,22 @@ def _close_connection(_connection: Any, entry: ConnectionPoolEntry) -> None:
 
 def _prepare_sqlite(connection: Any, _record: Any) -> None:
     connection.isolation_level = None  # the driver would begin transactions on its own, and too late
-    for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "busy_timeout=30000"):
+    _switch_to_wal(connection)
+    for pragma in ("synchronous=FULL", "foreign_keys=ON"):
         connection.execute(f"PRAGMA {pragma}").close()
+
+
+def _switch_to_wal(connection: Any) -> None:
+    """Of several connections that switch a new file at once SQLite lets some wait and refuses others at once."""
+    give_up = time.monotonic() + SQLITE_WAIT
+    while True:
+        try:
+            connection.execute("PRAGMA journal_mode=WAL").close()
+            return
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY or time.monotonic() > give_up:
+                raise
+        time.sleep(0.01)
 
 
 def _begin_sqlite(connection: Connection) -> None:

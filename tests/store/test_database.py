@@ -53,6 +53,29 @@ def test_several_servers_migrate_at_once(kind: str, tmp_path, postgres_server: s
     database.close()
 
 
+def test_connections_that_open_a_new_file_at_once_wait_for_each_other(tmp_path) -> None:
+    """SQLite refuses some of those that switch a file to WAL, whatever its timeout."""
+    errors: list[Exception] = []
+
+    def open_file(url: str, barrier: threading.Barrier) -> None:
+        engine = connect(url)
+        barrier.wait()
+        try:
+            engine.connect().close()
+        except Exception as error:
+            errors.append(error)
+        engine.dispose()
+
+    for number in range(100):
+        one = (f"sqlite:///{tmp_path}/{number}.db", threading.Barrier(6))
+        threads = [threading.Thread(target=open_file, args=one) for _ in range(6)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert errors == []
+
+
 def test_sqlite_is_durable(sqlite_url: str) -> None:
     database = Database(sqlite_url)
     with database.read() as session:

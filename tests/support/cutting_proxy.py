@@ -13,7 +13,10 @@ BUFFER = 256 << 10  # of the sockets: what a broken line takes with it
 
 
 class CuttingProxy:
-    """`url` leads to `target`. A context manager. cuts: how many connections it broke so far."""
+    """`url` leads to `target`. A context manager. cuts: how many connections it broke so far.
+
+    received: bytes that it read from clients, headers and all.
+    """
 
     def __init__(self, target: str, seed: int, least: int, most: int) -> None:
         parts = urlsplit(target)
@@ -27,7 +30,7 @@ class CuttingProxy:
         self._threads: list[threading.Thread] = []
         self._open: set[socket.socket] = set()
         self.url = f"http://127.0.0.1:{self._listener.getsockname()[1]}"
-        self.cuts = 0
+        self.cuts = self.received = 0
 
     def __enter__(self) -> Self:
         self._start(self._accept)
@@ -63,6 +66,7 @@ class CuttingProxy:
             while chunk := source.recv(1 << 16):
                 if left is not None:
                     left -= len(chunk)
+                    self.received += len(chunk)
                     if left <= 0:
                         self.cuts += 1
                         break

@@ -20,7 +20,7 @@ class Preset(StrEnum):
 
 PRESET_HELP: dict[Preset, str] = {
     Preset.auto: "full on a GPU, standard on a CPU",
-    Preset.paper: "the paper as printed: zero start, 50,000 steps",
+    Preset.paper: "the paper's method: starts from the mean of all photographs, no refined cameras, 50,000 steps",
     Preset.full: "starts from the best photograph per face, 50,000 steps; for GPUs",
     Preset.standard: "starts from the best photograph per face, 1,500 steps; minutes on a CPU",
     Preset.preview: "starts from the best photograph per face, coarse to fine; about two minutes on a CPU",

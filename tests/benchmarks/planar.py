@@ -24,7 +24,7 @@ import torch
 from harness import RESULTS, Results, Stopwatch, markdown_table, write_report
 from torch import Tensor
 
-from advtex_engine.config import PRESETS
+from advtex_engine.config import PRINTED
 from advtex_engine.discriminator import PatchDiscriminator
 from advtex_engine.examples import InputForm
 from advtex_engine.metrics import nearest_patch_loss, sliced_wasserstein
@@ -75,7 +75,7 @@ def optimize(
         maps,
         planar_pairs(len(color), device, auxiliary=auxiliary),
         texture.to(device)[maps.slot_map >= 0],
-        PRESETS["paper"],
+        PRINTED,
         kind="scene",
         steps=steps,
         generator=torch.Generator(device).manual_seed(seed),

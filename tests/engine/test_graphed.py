@@ -20,7 +20,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from advtex_engine import graphed
-from advtex_engine.config import PRESETS, Preset
+from advtex_engine.config import PRESETS, PRINTED, Preset
 from advtex_engine.discriminator import PatchDiscriminator
 from advtex_engine.graphed import WARMUP, Stepper, capture_graph
 from advtex_engine.operations import plain_operations
@@ -41,7 +41,7 @@ PRESET = dataclasses.replace(
     PRESETS["standard"], pretraining=2, averaging=30, l1_decays=50, max_crop=(64, 64), perturbation=0.01
 )
 LAUNCH = 5
-SMALL = dataclasses.replace(PRESETS["paper"], pretraining=4, averaging=20, max_crop=(32, 32))
+SMALL = dataclasses.replace(PRINTED, pretraining=4, averaging=20, max_crop=(32, 32))
 
 
 class Tape(TorchDispatchMode):

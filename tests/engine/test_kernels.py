@@ -18,7 +18,7 @@ from torch import Tensor
 from advtex_engine import alignment, examples, losses, texture
 from advtex_engine.alignment import BLOCK
 from advtex_engine.batches import PairSampler
-from advtex_engine.config import PRESETS, Preset
+from advtex_engine.config import PRESETS, PRINTED, Preset
 from advtex_engine.discriminator import PatchDiscriminator
 from advtex_engine.examples import InputForm
 from advtex_engine.operations import choose_operations, plain_operations
@@ -330,7 +330,7 @@ def test_two_hundred_steps_on_the_kernels_end_like_those_on_torch(
 ) -> None:
     monkeypatch.setattr(fused, "BLOCK", 1024)  # a crop: the interpreter computes what a program masks, too
     preset = dataclasses.replace(
-        PRESETS["paper"], pretraining=20, averaging=50, lr_end=0.1, lr_discriminator=3e-4, max_crop=(32, 32)
+        PRINTED, pretraining=20, averaging=50, lr_end=0.1, lr_discriminator=3e-4, max_crop=(32, 32)
     )
     with one_thread_each():  # how sums are cut into threads shows in their last digit, and then in the sign of an L1
         ours, plain = optimizer(fused, preset, 200), optimizer(None, preset, 200)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from advtex_engine.checkpoint import WorkFolder
 from advtex_engine.config import METHODS as METHOD_NAMES
-from advtex_engine.config import PRESETS, PyramidLevel, TextureConfig
+from advtex_engine.config import PRINTED, PyramidLevel, TextureConfig
 from advtex_engine.discriminator import PatchDiscriminator
 from advtex_engine.errors import Stopped
 from advtex_engine.live import Live
@@ -77,7 +77,7 @@ def task(
 ) -> MethodInput:
     maps = build_view_maps(atlas, views, "scene")
     listener = monitor or Monitor()
-    preset = replace(PRESETS["paper"], levels=(PyramidLevel(3),), start="mean")
+    preset = replace(PRINTED, levels=(PyramidLevel(3),), start="mean")
     scene = Scene(atlas.mesh, views)
     return MethodInput(
         scene,
@@ -245,7 +245,7 @@ def small_optimizer(around: MethodInput, **ablation: bool) -> AdversarialOptimiz
         maps,
         own_pairs(maps),
         around.means[1][maps.slot_map >= 0],
-        replace(PRESETS["paper"], **ablation),  # type: ignore[arg-type]  # flags of the ablations
+        replace(PRINTED, **ablation),  # type: ignore[arg-type]  # flags of the ablations
         kind="scene",
         steps=4,
         generator=torch.Generator().manual_seed(0),

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from advtex_engine.config import PRESETS, Preset
+from advtex_engine.config import PRINTED, Preset
 from advtex_engine.discriminator import PatchDiscriminator
 from advtex_engine.examples import assemble
 from advtex_engine.losses import adversarial_loss, discriminator_loss, l1_loss, patch_masks
@@ -19,7 +19,7 @@ from advtex_engine.planar import planar_views
 from advtex_engine.texture import bilinear_footprint, decode_uv
 
 WIDTH, HEIGHT = 96, 72
-PRESET = dataclasses.replace(PRESETS["paper"], l1_decays=4)
+PRESET = dataclasses.replace(PRINTED, l1_decays=4)
 
 
 def optimizer(seed: int = 0, steps: int = 20, preset: Preset = PRESET) -> AdversarialOptimizer:
@@ -217,6 +217,22 @@ def test_pretraining_moves_the_discriminator_alone() -> None:
     assert not torch.equal(of.parameters[0], weights)
     of.step()
     assert not torch.equal(of.values, start)
+
+
+@pytest.mark.parametrize("target", ["source", "auxiliary"])
+def test_l1_is_the_distance_to_what_the_preset_names(target: str) -> None:
+    of = optimizer(preset=dataclasses.replace(PRESET, l1_target=target))
+    batch = of.draw()
+    named, other = batch.condition, batch.real
+    if target == "auxiliary":
+        named, other = other, named
+    assert not torch.equal(named, other)
+    seen = batch.visible.expand_as(named) > 0
+    fake = of.sampler.image((of.values.detach()[batch.slots.long()] * batch.weights[..., None]).sum(1)) * 2 - 1
+    distance, wrong = ((fake - image)[seen].abs().mean() for image in (named, other))
+    found = float(of.play(batch).l1.detach())
+    assert found == pytest.approx(float(distance), rel=1e-5)
+    assert found != pytest.approx(float(wrong), rel=1e-3)
 
 
 def test_l1_to_the_start_pulls_back_to_it() -> None:

@@ -105,6 +105,7 @@ def test_a_run_leaves_models_previews_and_a_report(whole: tuple[Path, Recorder])
     assert len(report["scan"]["heldout"]) == 2
     assert report["scan"]["views"] == 10
     assert set(report["heldout"]) == {"texture", "mean"}
+    assert 0 < report["speckled_texels"] < 0.5
     assert report["options"]["steps"] == STEPS
     assert {"graph", "steps_per_launch", "kernels", "precision", "reasons"} <= set(report["step"])
     assert report["versions"]["torch"].startswith("2.")
@@ -318,6 +319,14 @@ def test_the_mean_method_takes_no_steps(scan: Path, tmp_path: Path) -> None:
 def test_auto_is_standard_on_a_cpu_and_full_on_a_gpu() -> None:
     assert resolve_preset(TextureConfig(), torch.device("cpu")) == PRESETS["standard"]
     assert resolve_preset(TextureConfig(), torch.device("cuda")) == PRESETS["full"]
+
+
+def test_a_shorter_run_is_the_same_in_proportion() -> None:
+    shorter = resolve_preset(TextureConfig(preset="preview", steps=550), torch.device("cpu"))
+    whole = PRESETS["preview"]
+    assert whole.steps == 1_100
+    assert [level.steps for level in shorter.levels] == [400, 150]
+    assert (shorter.pretraining, shorter.averaging) == (whole.pretraining // 2, whole.averaging // 2)
 
 
 @pytest.mark.parametrize(

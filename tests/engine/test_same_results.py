@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 
 from advtex_engine import optimize, pipeline
-from advtex_engine.config import PRESETS, Preset, TextureConfig
+from advtex_engine.config import PRESETS, PRINTED, Preset, TextureConfig
 from advtex_engine.discriminator import PatchDiscriminator
 from advtex_engine.examples import InputForm
 from advtex_engine.metrics import gradient_ratio, psnr, ssim
@@ -55,7 +55,7 @@ def optimizer(preset: Preset, steps: int) -> AdversarialOptimizer:
 def test_two_hundred_steps_by_flags_end_like_those_by_branches() -> None:
     """On a CPU what is skipped is not computed; on a GPU it is, and then not applied."""
     preset = dataclasses.replace(
-        PRESETS["paper"], pretraining=20, averaging=50, lr_end=0.1, lr_discriminator=3e-4, max_crop=(32, 32)
+        PRINTED, pretraining=20, averaging=50, lr_end=0.1, lr_discriminator=3e-4, max_crop=(32, 32)
     )
     branches, flags = optimizer(preset, 200), optimizer(preset, 200)
     flags.branches = False

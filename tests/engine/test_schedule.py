@@ -7,10 +7,10 @@ import dataclasses
 import pytest
 import torch
 
-from advtex_engine.config import PRESETS, Preset
+from advtex_engine.config import PRINTED, Preset
 from advtex_engine.schedule import COLUMNS, Schedule
 
-PRESET = dataclasses.replace(PRESETS["paper"], l1_decays=4, lr_end=0.1)
+PRESET = dataclasses.replace(PRINTED, l1_decays=4, lr_end=0.1)
 
 
 def schedule(steps: int, preset: Preset = PRESET) -> Schedule:

@@ -82,7 +82,7 @@ def judge(real: Tensor, fake: Tensor, shares: Tensor, pretraining: Tensor) -> Ve
 
 
 def l1_loss(fake: Tensor, real: Tensor, visible: Tensor) -> Tensor:
-    """Mean absolute difference to the warped auxiliary image where it is visible; images [B,3,H,W]."""
+    """Mean absolute difference to an image where the auxiliary view sees the surface; images [B,3,H,W]."""
     return masked_mean((fake - real).abs(), visible)
 
 

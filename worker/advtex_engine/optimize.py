@@ -26,7 +26,7 @@ from advtex_engine.batches import Batch, PairSampler
 from advtex_engine.checkpoint import restore_generator
 from advtex_engine.config import Preset
 from advtex_engine.discriminator import MIN_SIZE, PatchDiscriminator
-from advtex_engine.examples import InputForm
+from advtex_engine.examples import Examples, InputForm
 from advtex_engine.losses import example_shares, feature_loss
 from advtex_engine.operations import Operations, choose_operations, plain_operations
 from advtex_engine.schedule import Schedule
@@ -199,14 +199,19 @@ class AdversarialOptimizer:
         real_logits, of_real = self.discriminator.examine(shown.real_input, self._of_real)
         shares = example_shares(batch.foreground, shown.visible)
         verdict = self.operations.judge(real_logits, fake_logits, shares, self.schedule.pretraining)
-        if self.start is None:
-            l1 = self.operations.l1_loss(shown.fake, shown.real, shown.visible)
-        else:
-            l1 = self.operations.l1_loss(fake, self._render(self.start, batch), batch.visible)
+        l1 = self._l1(batch, fake, shown)
         features = torch.zeros_like(l1)
         if self.preset.feature_weight:
             features = feature_loss(of_fake, of_real, self.operations.mean_difference)
         return Losses(verdict.discriminator, verdict.adversarial, l1, features, verdict.ahead)
+
+    def _l1(self, batch: Batch, fake: Tensor, shown: Examples) -> Tensor:
+        """L1 of the render [1,3,h,w] to what the preset names."""
+        if self.start is not None:
+            return self.operations.l1_loss(fake, self._render(self.start, batch), batch.visible)
+        if self.preset.l1_target == "source":
+            return self.operations.l1_loss(shown.fake, batch.condition, shown.visible)
+        return self.operations.l1_loss(shown.fake, shown.real, shown.visible)
 
     def _offsets(self, batch: Batch, fake: Tensor) -> Tensor:
         """Offsets [2,gh,gw,2] that move the real and the fake example onto the source."""

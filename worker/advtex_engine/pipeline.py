@@ -55,6 +55,7 @@ from advtex_engine.report import (
 from advtex_engine.result_page import write_page
 from advtex_engine.scene import Atlas, Mesh, Scene, View
 from advtex_engine.shortage import memory_problem
+from advtex_engine.speckle import speckle_share
 from advtex_engine.streaming import host_allocator, keep_off
 from advtex_engine.texture import fill_holes
 from advtex_engine.toning import tone_views
@@ -150,6 +151,7 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
         "refinement": refinement and refinement | given.facts.get("refinement", {}),
         "atlas": {key: getattr(atlas, key) for key in ("width", "height", "source", "charts", "pages")},
         "touched_texels": maps[1].slots,
+        "speckled_texels": speckle_share(texture, maps[1].slot_map >= 0),
         "stages": stages.records,
         "saving_seconds": round(folder.seconds + (0 if folder is budget.folder else budget.folder.seconds), 3),
         "step": given.facts.get("step"),
@@ -173,7 +175,8 @@ def resolve_preset(config: TextureConfig, device: torch.device) -> Preset:
     share = config.steps / preset.steps
     levels = [PyramidLevel(round(level.steps * share), level.scale) for level in preset.levels]
     levels[-1] = PyramidLevel(config.steps - sum(level.steps for level in levels[:-1]), levels[-1].scale)
-    return replace(preset, levels=tuple(levels), pretraining=int(preset.pretraining * share))
+    pretraining, averaging = int(preset.pretraining * share), int(preset.averaging * share)
+    return replace(preset, levels=tuple(levels), pretraining=pretraining, averaging=averaging)
 
 
 def fingerprint(scan: Path, config: TextureConfig) -> str:

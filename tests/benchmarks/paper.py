@@ -1,0 +1,241 @@
+"""The preset `paper` beside what the paper compares its method with, cameras as they came.
+
+    python tests/benchmarks/paper.py [SCAN …] [--errors cameras geometry] [--levels 1 2.75 4.5] [--rows l1 adversarial]
+
+On the study's synthetic scans (`study.py`: 256x192, 60 views) against the true object, and on scans of one's own at
+320x240 against every 8th frame, held out. Nothing is refined but the cameras of `colormap`, which is nothing without.
+Beside every row stand its LPIPS over that of `l1`, as in the paper's table of real scans, and its share of speckled
+texels over that of `view_selection`. `--rows suspects` changes the printed recipe, which speckles in 3D, one suspect at
+a time, and takes the preset's choices back one at a time; --steps 6000 tells them apart.
+
+Writes paper.json (one cell per scan and row), paper.md, and per scan a sheet of photographs and renders below
+--results. Stopped and run again, it goes on with the cells that are missing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import torch
+from harness import (
+    RESULTS,
+    Results,
+    Stopwatch,
+    draw,
+    load_truth,
+    markdown_table,
+    needed_lpips,
+    parsed_size,
+    picture,
+    prepare,
+    run_method,
+    score_model,
+    score_texture,
+    shown_mean,
+    write_report,
+)
+from study import make_scan
+
+from advtex_engine.config import PRESETS, TextureConfig
+from advtex_engine.methods import MethodInput
+from advtex_engine.perceptual import Lpips
+from advtex_engine.pipeline import choose_device, resolve_preset
+from advtex_engine.speckle import speckle_share
+
+SIZE, VIEWS, FACES, TURN = "256x192", 60, 20_000, 5.0
+"""Of the study's scans; the turn in degrees is the paper's e_a."""
+SCAN_SIZE, SCAN_FACES, HOLDOUT = "320x240", 80_000, 8
+"""Of scans of one's own."""
+PRINTED = {"Object": 0.175 / 0.197, "ScanNet": 0.395 / 0.470, "CAD": 0.176 / 0.199}
+"""The paper's LPIPS over that of its L1 (table 2)."""
+TABLE = {
+    "lpips": "LPIPS",
+    "of_l1": "of l1's",
+    "gradient_ratio": "gradient ratio",
+    "band_error": "band error",
+    "flat_energy": "energy where flat",
+    "s3_difference": "S3 difference",
+    "nearest_patch": "nearest patch",
+    "nearest_patch_reverse": "nearest patch, truth to texture",
+    "speckle": "speckled texels",
+    "of_selection": "of view selection's",
+}
+SHOWN = ("mean", "l1", "view_selection", "adversarial")
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """A method, and what differs from the preset and from the options."""
+
+    method: str = "adversarial"
+    preset: dict[str, Any] = dataclasses.field(default_factory=dict)
+    options: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+
+METHOD_ROWS = {
+    name: Row(name)
+    for name in (
+        "mean",
+        "l1",
+        "sharpest",
+        "colormap",
+        "view_selection",
+        "adversarial",
+        "adversarial_no_auxiliary",
+        "adversarial_no_condition",
+    )
+}
+
+FROM_MEAN: dict[str, Any] = {"start": "mean", "lr_texture": 1e-3, "l1_target": "auxiliary", "averaging": 0}
+"""As printed, but for the start: black takes thousands of steps to get away from, and hides all else in short runs."""
+SUSPECTS = {
+    "as printed": Row(preset={**FROM_MEAN, "start": "zero"}),
+    "from the mean": Row(preset=FROM_MEAN),
+    "from the mean, averaged": Row(preset={**FROM_MEAN, "averaging": 2_000}),
+    "from the mean, half the rate": Row(preset={**FROM_MEAN, "lr_texture": 5e-4}),
+    "from the mean, a tenth of the rate": Row(preset={**FROM_MEAN, "lr_texture": 1e-4}),
+    "from the mean, L1 to the source": Row(preset={**FROM_MEAN, "l1_target": "source"}),
+    "from the mean, fewer texels": Row(preset=FROM_MEAN, options={"texels_per_pixel": 0.8}),
+    "from the mean, wider pairs": Row(preset={**FROM_MEAN, "max_pair_angle": 30.0}),
+    "from the mean, closer pairs": Row(preset={**FROM_MEAN, "min_pair_overlap": 0.7}),
+    "without averaging": Row(preset={"averaging": 0}),
+    "L1 to the auxiliary": Row(preset={"l1_target": "auxiliary"}),
+    "from zero": Row(preset={"start": "zero"}),
+}
+"""One at a time from the printed recipe on, and taken back from the preset's."""
+
+
+def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scans", nargs="*", type=Path, help="folders or zip files")
+    parser.add_argument("--errors", nargs="*", default=["cameras", "geometry"], choices=["cameras", "geometry"])
+    parser.add_argument("--levels", nargs="+", type=float, default=[1.0, 2.75, 4.5], help="n of the error's size")
+    parser.add_argument("--rows", nargs="+", default=list(METHOD_ROWS), choices=[*METHOD_ROWS, *SUSPECTS, "suspects"])
+    parser.add_argument("--steps", type=int, default=PRESETS["paper"].steps)
+    parser.add_argument("--scan-size", default=SCAN_SIZE, help="WIDTHxHEIGHT of the views of one's own scans")
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--lpips-weights", type=Path, help="folder; default: $ADVTEX_LPIPS_WEIGHTS, else the cache")
+    parser.add_argument("--results", type=Path, default=RESULTS / "paper", help="folder of the results")
+    parsed: argparse.Namespace = parser.parse_args(line)
+    if "suspects" in parsed.rows:
+        parsed.rows = [name for name in parsed.rows if name != "suspects"] + list(SUSPECTS)
+    return parsed
+
+
+def cells(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """The settings of every cell, scan by scan, each scan's refined cameras last."""
+    rows = sorted(arguments.rows, key=lambda name: _row(name).method == "colormap")
+    study = [
+        {"scan": f"{errors} {level:g}", "size": SIZE, "errors": errors, "level": level}
+        for errors in arguments.errors
+        for level in arguments.levels
+    ]
+    own = [{"scan": scan.stem, "size": arguments.scan_size} for scan in arguments.scans]
+    return [{**scan, "row": name, "steps": arguments.steps} for scan in (*study, *own) for name in rows]
+
+
+def _row(name: str) -> Row:
+    return METHOD_ROWS.get(name) or SUSPECTS[name]
+
+
+def _config(arguments: argparse.Namespace, cell: dict[str, Any]) -> TextureConfig:
+    row, synthetic = _row(cell["row"]), "errors" in cell
+    steps = {"steps": arguments.steps} if row.method.startswith("adversarial") else {}
+    return TextureConfig(
+        preset="paper",
+        method=row.method,
+        size=parsed_size(cell["size"]),
+        holdout=None if synthetic else HOLDOUT,
+        face_budget=FACES if synthetic else SCAN_FACES,
+        device=arguments.device,
+        **steps,
+        **row.options,
+    )
+
+
+def fill(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
+    """Runs every cell that is not in the results yet."""
+    device = choose_device(arguments.device)
+    paths = {scan.stem: scan for scan in arguments.scans}
+    missing = [cell for cell in cells(arguments) if results.find(cell) is None]
+    for name in dict.fromkeys(cell["scan"] for cell in missing):
+        with tempfile.TemporaryDirectory(prefix="advtex-paper-") as folder:
+            scan = paths.get(name, Path(folder) / "scan")
+            inputs: dict[object, MethodInput] = {}
+            for cell in (cell for cell in missing if cell["scan"] == name):
+                if "errors" in cell and not scan.exists():
+                    turn = TURN if cell["errors"] == "cameras" else 0.0
+                    make_scan(scan, {**cell, "views": VIEWS, "model": 0, "turn": turn})
+                _run(arguments, scan, cell, inputs, Path(folder) / "work", results, lpips, device)
+
+
+def _run(
+    arguments: argparse.Namespace,
+    scan: Path,
+    cell: dict[str, Any],
+    inputs: dict[object, MethodInput],
+    work: Path,
+    results: Results,
+    lpips: Lpips,
+    device: torch.device,
+) -> None:
+    """One row of one scan. inputs: what was made of the scan so far, by what it depends on."""
+    row, config = _row(cell["row"]), _config(arguments, cell)
+    key = (config.refines, *row.options.values())
+    if key not in inputs:
+        inputs.clear()
+        inputs[key] = prepare(scan, config, work, device)
+    preset = dataclasses.replace(resolve_preset(config, device), **row.preset)
+    given = dataclasses.replace(inputs[key], config=config, preset=preset)
+    watch = Stopwatch()
+    texture = run_method(given, row.method)
+    seconds = watch.seconds
+    kept = arguments.results / cell["scan"].replace(" ", "_")
+    if "errors" in cell:
+        truth = load_truth(scan)
+        scores = score_texture(given.atlas, texture, truth, lpips)
+        if cell["row"] in SHOWN:
+            draw(kept / f"{cell['row']}.png", scan, truth, {cell["row"]: picture(given.atlas, texture, truth)})
+    else:
+        scores = score_model(given, texture, scan, kept / cell["row"], None, arguments.lpips_weights)
+    speckle = speckle_share(texture, given.maps[1].slot_map >= 0)
+    results.add(cell, scores if speckle is None else {**scores, "speckle": speckle}, seconds)
+
+
+def report(arguments: argparse.Namespace, results: Results) -> None:
+    """paper.md: a table per scan of everything that was run, the least LPIPS first."""
+    body = "The paper's own LPIPS over that of its L1 (table 2): "
+    body += ", ".join(f"{name} {share:.2f}" for name, share in PRINTED.items()) + ".\n"
+    keys = dict.fromkeys((cell["settings"]["scan"], cell["settings"]["size"]) for cell in results.cells)
+    for scan, size in keys:
+        here = [cell for cell in results.cells if (cell["settings"]["scan"], cell["settings"]["size"]) == (scan, size)]
+        rows = [_line(cell, here) for cell in sorted(here, key=lambda cell: float(cell["scores"]["lpips"]))]
+        body += f"\n## {scan}, {size}\n\n{markdown_table(['row', 'steps', *TABLE.values(), 'seconds'], rows)}"
+    write_report(arguments.results / "paper.md", "The paper's method beside its peers", results.cells, body)
+
+
+def _line(cell: dict[str, Any], here: list[dict[str, Any]]) -> list[object]:
+    """A row of the table; ratios to rows that were not run are dashes."""
+    settings, scores = cell["settings"], dict(cell["scores"])
+    for name, score, row in (("of_l1", "lpips", "l1"), ("of_selection", "speckle", "view_selection")):
+        known = [other["scores"].get(score) for other in here if other["settings"]["row"] == row]
+        if known and known[0] and score in scores:
+            scores[name] = scores[score] / known[0]
+    stepped = _row(settings["row"]).method.startswith("adversarial")
+    shown = (shown_mean([{"scores": scores}], name) for name in TABLE)
+    return [settings["row"], settings["steps"] if stepped else "-", *shown, cell["seconds"]]
+
+
+def main(line: list[str] | None = None) -> None:
+    arguments = arguments_of(line)
+    results = Results(arguments.results / "paper.json")
+    fill(arguments, results, needed_lpips(arguments.lpips_weights))
+    report(arguments, results)
+
+
+if __name__ == "__main__":
+    main()

@@ -8,8 +8,8 @@ Beside every row stand its LPIPS over that of `l1`, as in the paper's table of r
 texels over that of `view_selection`. `--rows suspects` changes the printed recipe, which speckles in 3D, one suspect at
 a time, and takes the preset's choices back one at a time; --steps 6000 tells them apart.
 
-Writes paper.json (one cell per scan and row), paper.md, and per scan a sheet of photographs and renders below
---results. Stopped and run again, it goes on with the cells that are missing.
+Writes paper.json (one cell per scan and row), paper.md, and renders beside photographs below --results. Stopped and run
+again, it goes on with the cells that are missing.
 """
 
 from __future__ import annotations
@@ -199,6 +199,7 @@ def _run(
         truth = load_truth(scan)
         scores = score_texture(given.atlas, texture, truth, lpips)
         if cell["row"] in SHOWN:
+            kept.mkdir(parents=True, exist_ok=True)
             draw(kept / f"{cell['row']}.png", scan, truth, {cell["row"]: picture(given.atlas, texture, truth)})
     else:
         scores = score_model(given, texture, scan, kept / cell["row"], None, arguments.lpips_weights)

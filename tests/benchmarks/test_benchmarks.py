@@ -9,6 +9,7 @@ from typing import Any
 import compiled
 import discriminator
 import harness
+import paper
 import parts
 import pytest
 import scans
@@ -200,3 +201,26 @@ def test_compiled_steps_are_timed_beside_the_plain_one(tmp_path: Path, monkeypat
     assert rows[0][-1] == "1.00 |"
     assert float(rows[0][4]) >= float(rows[0][5]) > 0
     assert rows[1][3] == "failed: no compiler"
+
+
+@pytest.mark.slow
+def test_the_paper_s_method_stands_beside_its_peers_and_its_suspects(
+    tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synthesize(tmp_path / "desk", views=6, width=96, height=64)
+    for name, value in {"SIZE": "64x64", "VIEWS": 6, "FACES": 600, "SCAN_FACES": 600, "HOLDOUT": 3}.items():
+        monkeypatch.setattr(paper, name, value)
+    line = [str(tmp_path / "desk"), "--scan-size", "96x64", "--errors", "geometry", "--levels", "1", "--steps", "2"]
+    line += ["--rows", "l1", "view_selection", "adversarial", "from the mean, fewer texels", "--device", "cpu"]
+    line += ["--lpips-weights", str(weights), "--results", str(tmp_path / "out")]
+    paper.main(line)
+    found = json.loads((tmp_path / "out" / "paper.json").read_text())["cells"]
+    assert len(found) == 8
+    assert all(0 <= cell["scores"]["speckle"] < 1 for cell in found)
+    page = (tmp_path / "out" / "paper.md").read_text()
+    assert page.count("| l1 | - |") == page.count("| adversarial | 2 |") == 2
+    assert (tmp_path / "out" / "geometry_1" / "adversarial.png").stat().st_size > 1000
+    assert (tmp_path / "out" / "desk" / "adversarial" / "sheet.png").stat().st_size > 1000
+
+    monkeypatch.setattr(paper, "prepare", lambda *_: pytest.fail("every cell is there already"))
+    paper.main(line)

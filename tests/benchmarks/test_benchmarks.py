@@ -8,6 +8,7 @@ from typing import Any
 
 import compiled
 import discriminator
+import examples
 import harness
 import paper
 import parts
@@ -224,3 +225,23 @@ def test_the_paper_s_method_stands_beside_its_peers_and_its_suspects(
 
     monkeypatch.setattr(paper, "prepare", lambda *_: pytest.fail("every cell is there already"))
     paper.main(line)
+
+
+@pytest.mark.slow
+def test_real_examples_are_as_far_from_their_sources_as_the_scan_s_errors(
+    tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(examples, "LEAST_PIXELS", 500)
+    for name, error in (("exact", 0.0), ("off", 0.02)):
+        synthesize(tmp_path / name, views=30, width=96, height=72, camera_error=error, geometry_error=0.0)
+    line = [str(tmp_path / "exact"), str(tmp_path / "off"), "--scan-size", "96x72", "--errors", "--pairs", "8"]
+    line += ["--device", "cpu", "--lpips-weights", str(weights), "--results", str(tmp_path / "out")]
+    examples.main(line)
+    cells = json.loads((tmp_path / "out" / "examples.json").read_text())["cells"]
+    exact, off = (cell["scores"] for cell in cells)
+    assert exact["pairs"] == off["pairs"] == 8
+    assert exact["real lpips"] < 0.5 * off["real lpips"]
+    assert exact["l1 lpips"] < off["l1 lpips"]
+    page = (tmp_path / "out" / "examples.md").read_text()
+    assert "| exact | 96x72 |" in page
+    assert "| off | 96x72 |" in page

@@ -7,7 +7,8 @@ and its own noise. A texture that cannot be told from it is as far from the phot
 examples says what the adversarial loss asks for: where the texture of least L1 distance is nearer, a discriminator that
 knows all leads away from the photographs. Measured over pixels that the auxiliary view sees, with cameras as they came,
 on the study's scans (`study.py`) and on scans of one's own; `l1` and `view_selection` at the same pixels stand beside
-them. "Toned" examples have the source's mean color. The pairs are also parted by overlap, the lesser and larger half.
+them. "Toned" examples have the source's mean color. Pairs are also parted by whether the preset `paper` keeps them, and
+into halves by overlap.
 
 Writes examples.json (one cell per scan) and examples.md below --results; goes on with missing scans when started again.
 """
@@ -48,6 +49,8 @@ from advtex_engine.texture import bilinear_footprint, decode_uv, sample_texels
 from advtex_engine.views import DEPTH_TOLERANCE, ViewMaps, overlaps, related_pairs
 
 TEXTURES = ("l1", "view_selection")
+KEPT = {"kept": True, "left out": False}
+PARTS = ("kept", "left out", "less overlap", "more overlap")
 LEAST_PIXELS = 3_000
 """Pairs of which the auxiliary view sees less are left out."""
 
@@ -66,16 +69,20 @@ def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
     return parsed
 
 
-def drawn_pairs(given: MethodInput, count: int) -> Iterator[tuple[int, int, float]]:
-    """Source, auxiliary view and the share of the source that it sees, of pairs as the preset `paper` draws them."""
+def drawn_pairs(given: MethodInput, count: int) -> Iterator[tuple[int, int, float, bool]]:
+    """Source, auxiliary view, the share of the source that it sees, and whether the preset `paper` keeps the pair."""
     maps, kind = given.maps[1], given.scene.kind
-    pairs = related_pairs(maps, kind, PAPER.max_pair_angle, PAPER.min_pair_overlap)
+    every, kept = (
+        related_pairs(maps, kind, PAPER.max_pair_angle, PAPER.min_pair_overlap, nearest)
+        for nearest in (1.0, PAPER.nearest_share)
+    )
     share = overlaps(maps, kind, 180.0, range(maps.count))
-    others = [(source, k) for source in range(maps.count) for k in range(1, int(pairs.count[source]))]
+    rows = [row[:number].tolist() for row, number in zip(kept.auxiliary, kept.count, strict=True)]
+    others = [(source, k) for source in range(maps.count) for k in range(1, int(every.count[source]))]
     order = torch.randperm(len(others), generator=torch.Generator().manual_seed(0)).tolist()
     for source, k in (others[index] for index in order[:count]):
-        auxiliary = int(pairs.auxiliary[source, k])
-        yield source, auxiliary, float(share[source, auxiliary])
+        auxiliary = int(every.auxiliary[source, k])
+        yield source, auxiliary, float(share[source, auxiliary]), auxiliary in rows[source]
 
 
 def example(maps: ViewMaps, kind: str, source: int, auxiliary: int) -> tuple[Tensor, Tensor]:
@@ -102,14 +109,14 @@ def rendered(maps: ViewMaps, texture: Tensor, view: int) -> Tensor:
 def measured(given: MethodInput, textures: dict[str, Tensor], count: int, lpips: Lpips) -> dict[str, float]:
     """Means over the pairs: LPIPS and gradient ratio of examples and textures against the sources."""
     maps, rows = given.maps[1], list[dict[str, float]]()
-    for source, auxiliary, share in drawn_pairs(given, count):
+    for source, auxiliary, share, kept in drawn_pairs(given, count):
         real, seen = example(maps, given.scene.kind, source, auxiliary)
         if int(seen.sum()) < LEAST_PIXELS:
             continue
         photo = maps.color[source].view_as(real) / 255
         toned = (real * (photo[seen].mean(0) / real[seen].mean(0).clamp(min=1e-3))).clamp(0, 1)
         shown = {"real": real, "toned": toned} | {name: rendered(maps, one, source) for name, one in textures.items()}
-        row = {"overlap": share}
+        row = {"overlap": share, "kept": float(kept)}
         for name, image in shown.items():
             whole = torch.where(seen[..., None], image, photo).cpu()
             comparison = Comparison("", photo.cpu(), whole, seen.cpu(), seen.cpu())
@@ -119,8 +126,11 @@ def measured(given: MethodInput, textures: dict[str, Tensor], count: int, lpips:
     rows.sort(key=lambda row: row["overlap"])
     means = {key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}
     half = len(rows) // 2
-    for name, part in (("least", rows[:half]), ("most", rows[half:])):
-        means |= {f"{name} {key}": sum(row[key] for row in part) / len(part) for key in ("real lpips", "l1 lpips")}
+    parts = {"less overlap": rows[:half], "more overlap": rows[half:]}
+    parts |= {name: [row for row in rows if bool(row["kept"]) == wanted] for name, wanted in KEPT.items()}
+    for name, part in parts.items():
+        real, of_l1 = (sum(row[key] for row in part) for key in ("real lpips", "l1 lpips"))
+        means |= {name: real / of_l1} if part else {}
     return means | {"pairs": float(len(rows))}
 
 
@@ -158,14 +168,14 @@ def report(arguments: argparse.Namespace, results: Results) -> None:
     rows: list[list[Any]] = []
     for cell in results.cells:
         scores = cell["scores"]
-        shown = [scores[f"{name} lpips"] for name in ("real", "toned", *TEXTURES)]
+        shown: list[object] = [scores[f"{name} lpips"] for name in ("real", "toned", *TEXTURES)]
         shown += [scores[f"{name} gradient_ratio"] for name in ("real", "l1")]
-        shown += [scores["real lpips"] / scores["l1 lpips"]]
-        shown += [scores[f"{part} real lpips"] / scores[f"{part} l1 lpips"] for part in ("least", "most")]
-        rows.append([cell["settings"]["scan"], cell["settings"]["size"], *shown, scores["overlap"]])
+        shown += [scores["real lpips"] / scores["l1 lpips"], *(scores.get(part, "-") for part in PARTS)]
+        rows.append([cell["settings"]["scan"], cell["settings"]["size"], *shown])
     head = ["scan", "size", "real", "real, toned", *TEXTURES, "gradients of real", "gradients of l1"]
-    head += ["real over l1", "with less overlap", "with more overlap", "mean overlap"]
-    note = "LPIPS against the source photographs, which `l1` and `view_selection` were made of, too.\n\n"
+    head += ["real over l1", *PARTS]
+    note = "LPIPS against the source photographs, which `l1` and `view_selection` were made of, too. The last five columns"
+    note += " are ratios of the real examples' to that of `l1` at the same pixels.\n\n"
     write_report(arguments.results / "examples.md", "Real examples", results.cells, note + markdown_table(head, rows))
 
 

@@ -15,7 +15,7 @@ from advtex_engine.refine_points import surface_depths
 from advtex_engine.reproject import reproject, unproject_pixels
 from advtex_engine.scene import Atlas, Camera, Mesh, View
 from advtex_engine.texture import decode_uv
-from advtex_engine.views import ViewMaps, build_view_maps, overlaps, related_pairs
+from advtex_engine.views import ViewMaps, build_view_maps, example_differences, overlaps, related_pairs
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 
@@ -200,6 +200,45 @@ def test_overlaps_are_the_same_where_views_come_from_the_host_and_each_is_copied
     elsewhere = replace(maps, depth=maps.depth.as_subclass(Copied))
     assert overlaps(elsewhere, "object", 15.0, range(6)).equal(share)
     assert copied == [4, 2]
+
+
+def painted(maps: ViewMaps, levels: list[int]) -> ViewMaps:
+    """Each view in one gray of its own, but for its left half, which is 4 levels darker."""
+    color = torch.tensor(levels, dtype=torch.uint8)[:, None, None].repeat(1, maps.height * maps.width, 3)
+    color.view(len(levels), maps.height, maps.width, 3)[:, :, : maps.width // 2] -= 4
+    return replace(maps, color=color)
+
+
+def test_examples_differ_as_their_colors_do_wherever_the_views_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against the whole warped images, which are sampled at every pixel and not at every eighth."""
+    maps = painted(maps_of([camera_at(0.03 * index, index) for index in range(4)]), [40, 90, 50, 200])
+    related = torch.ones((4, 4), dtype=torch.bool).fill_diagonal_(False)
+    related[2, 3] = False
+    found = example_differences(maps, "object", related)
+    assert torch.equal(found.isinf(), ~related)
+    for source, auxiliary in related.nonzero().tolist():
+        _, points = pixel_points(maps, source)
+        relative = maps.world_to_camera[auxiliary] @ torch.linalg.inv(maps.world_to_camera[source])
+        color, visible = reproject(points, relative[:3].float(), maps, torch.tensor(auxiliary), 0.03)
+        visible &= maps.depth[source] > 0
+        expected = (color - maps.color[source])[visible].abs().mean()
+        assert float(found[source, auxiliary]) == pytest.approx(float(expected), abs=0.6)
+
+    monkeypatch.setattr(ViewMaps, "device", property(lambda _: torch.device("cpu:0")))
+    monkeypatch.setattr(views, "TOGETHER", 3)
+    assert torch.equal(example_differences(maps, "object", related), found)
+
+
+def test_of_related_views_those_stay_that_show_what_the_source_shows() -> None:
+    maps = painted(maps_of([camera_at(0.03 * index, index) for index in range(4)]), [40, 90, 50, 200])
+    every = related_pairs(maps, "object", 15.0, 0.3)
+    assert every.count.tolist() == [4, 4, 4, 4]
+    half = related_pairs(maps, "object", 15.0, 0.3, 0.5)
+    assert half.count.tolist() == [3, 3, 3, 3], "the view itself, and two of three"
+    rows = [half.auxiliary[index, :3].tolist() for index in range(4)]
+    assert rows == [[0, 1, 2], [1, 0, 2], [2, 0, 1], [3, 1, 2]]
+    fewest = related_pairs(maps, "object", 15.0, 0.3, 0.1)
+    assert [fewest.auxiliary[index, :2].tolist() for index in range(4)] == [[0, 2], [1, 2], [2, 0], [3, 1]]
 
 
 def test_a_view_without_near_neighbors_gets_the_one_that_overlaps_most() -> None:

@@ -74,6 +74,27 @@ def seen_share(points: Tensor, relative: Tensor, maps: ViewMaps, auxiliary: Tens
     return visible.view(z.shape).to(torch.float32).mean(1)
 
 
+def warped_difference(
+    points: Tensor, colors: Tensor, relative: Tensor, maps: ViewMaps, auxiliary: Tensor, tolerance: float
+) -> Tensor:
+    """Mean absolute difference [K] between a source's colors and those of K auxiliary views at the same points.
+
+    points: [P,3] metres in the source camera. colors: [P,3] in [0,255]. relative: [K,3,4] source camera to auxiliary
+    cameras. auxiliary: [K] view indices. tolerance: theta_z, metres. Points count that the auxiliary view sees; inf
+    where it sees none.
+    """
+    position, z = _project(points, relative, maps.intrinsics[auxiliary])
+    first = (auxiliary * (maps.width * maps.height)).repeat_interleave(len(points))[:, None]
+    size = (maps.width, maps.height)
+    seen, indices, weights = _visible(position.flatten(0, 1), z.flatten(), maps.depth.view(-1), size, tolerance, first)
+    around = maps.color.view(-1, 3)[indices + first].to(torch.float32)
+    warped = (around * weights[..., None]).sum(1).view(len(auxiliary), len(points), 3)
+    visible = seen.view(z.shape)
+    count = visible.sum(1)
+    total = ((warped - colors).abs().mean(2) * visible).sum(1)
+    return torch.where(count > 0, total / count.clamp(min=1), torch.inf)
+
+
 def reproject(
     points: Tensor, relative: Tensor, maps: ViewMaps, auxiliary: Tensor, tolerance: float
 ) -> tuple[Tensor, Tensor]:

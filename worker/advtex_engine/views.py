@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from advtex_engine.rasterize import rasterize_views
-from advtex_engine.reproject import seen_share, unproject_pixels
+from advtex_engine.reproject import seen_share, unproject_pixels, warped_difference
 from advtex_engine.scene import Atlas, View
 from advtex_engine.texture import encode_uv, number_slots, touched_slots
 from advtex_engine.uploads import uploaded
@@ -159,38 +159,71 @@ def overlaps(maps: ViewMaps, kind: str, max_angle: float, sources: Iterable[int]
     device = maps.device
     axes = maps.world_to_camera[:, 2, :3]
     near = (axes @ axes.T).clamp(-1, 1) >= math.cos(math.radians(max_angle))
-    ys = torch.arange(OVERLAP_STRIDE // 2, maps.height, OVERLAP_STRIDE)
-    xs = torch.arange(OVERLAP_STRIDE // 2, maps.width, OVERLAP_STRIDE)
-    pixels = (ys[:, None] * maps.width + xs).flatten().to(maps.depth.device)
-    xy = (torch.stack((xs.repeat(len(ys)), ys.repeat_interleave(len(xs))), 1) + 0.5).to(device)
     share = torch.zeros((maps.count, maps.count), device=device)
-    camera_to_world = torch.linalg.inv(maps.world_to_camera)
-    points = dict[int, Tensor]()
-    for source in sources:
-        depth = maps.depth[source, pixels].to(device, torch.float32)
-        seen = depth > 0
-        if bool(seen.any()):
-            points[source] = unproject_pixels(xy[seen], depth[seen], maps.intrinsics[source])
+    points = {source: points for source, (points, _) in _seen_points(maps, sources).items()}
     for first, block in _blocks(maps):
         for source in points:
-            auxiliary = near[source, first : first + len(block.depth)].nonzero().flatten()
-            for start in range(0, len(auxiliary), TOGETHER):
-                some = auxiliary[start : start + TOGETHER]
-                relative = (maps.world_to_camera[first + some] @ camera_to_world[source])[:, :3].to(torch.float32)
+            for some, relative in _together(maps, near, source, first, len(block.depth)):
                 seen_by = seen_share(points[source], relative, block, some, DEPTH_TOLERANCE[kind])
                 share[source, first + some] = seen_by
     return share
 
 
-def _blocks(maps: ViewMaps) -> Iterator[tuple[int, ViewMaps]]:
-    """The maps with only some views' depth and intrinsics, and the first of these views; depth is on the device.
+def example_differences(maps: ViewMaps, kind: str, related: Tensor) -> Tensor:
+    """Mean absolute difference [V,V], of 255, between each source and its related views [V,V] bool warped into it.
 
-    All at once where it is there already, else TOGETHER at a time, so that each view is copied once.
+    inf for all others. Estimated on every OVERLAP_STRIDE-th pixel, of those that both see.
+    """
+    difference = torch.full((maps.count, maps.count), torch.inf, device=maps.device)
+    seen = _seen_points(maps, range(maps.count))
+    for first, block in _blocks(maps, with_color=True):
+        for source, (points, pixels) in seen.items():
+            colors = maps.color[source, pixels].to(maps.device, torch.float32)
+            for some, relative in _together(maps, related, source, first, len(block.depth)):
+                found = warped_difference(points, colors, relative, block, some, DEPTH_TOLERANCE[kind])
+                difference[source, first + some] = found
+    return difference
+
+
+def _seen_points(maps: ViewMaps, sources: Iterable[int]) -> dict[int, tuple[Tensor, Tensor]]:
+    """Per source with foreground its points [P,3], metres in its camera, and their pixels [P] where views are kept."""
+    ys = torch.arange(OVERLAP_STRIDE // 2, maps.height, OVERLAP_STRIDE)
+    xs = torch.arange(OVERLAP_STRIDE // 2, maps.width, OVERLAP_STRIDE)
+    pixels = (ys[:, None] * maps.width + xs).flatten().to(maps.depth.device)
+    xy = (torch.stack((xs.repeat(len(ys)), ys.repeat_interleave(len(xs))), 1) + 0.5).to(maps.device)
+    found = dict[int, tuple[Tensor, Tensor]]()
+    for source in sources:
+        depth = maps.depth[source, pixels].to(maps.device, torch.float32)
+        seen = depth > 0
+        if bool(seen.any()):
+            points = unproject_pixels(xy[seen], depth[seen], maps.intrinsics[source])
+            found[source] = points, pixels[seen.to(pixels.device)]
+    return found
+
+
+def _together(maps: ViewMaps, wanted: Tensor, source: int, first: int, count: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """The source's wanted views [V,V] bool among the `count` from `first` on, TOGETHER at a time.
+
+    Yields their numbers from `first` on, [K], and the poses [K,3,4] from the source's camera to theirs.
+    """
+    inverse = torch.linalg.inv(maps.world_to_camera[source])
+    auxiliary = wanted[source, first : first + count].nonzero().flatten()
+    for start in range(0, len(auxiliary), TOGETHER):
+        some = auxiliary[start : start + TOGETHER]
+        yield some, (maps.world_to_camera[first + some] @ inverse)[:, :3].to(torch.float32)
+
+
+def _blocks(maps: ViewMaps, *, with_color: bool = False) -> Iterator[tuple[int, ViewMaps]]:
+    """The maps with only some views' depth, color and intrinsics, and the first of these views; all on the device.
+
+    All at once where they are there already, else TOGETHER at a time, so that each view is copied once. Color stays
+    where it is unless it is asked for.
     """
     together = maps.count if maps.depth.device == maps.device else TOGETHER
     for first in range(0, maps.count, together):
         part = slice(first, first + together)
-        yield first, replace(maps, depth=maps.depth[part].to(maps.device), intrinsics=maps.intrinsics[part])
+        block = replace(maps, depth=maps.depth[part].to(maps.device), intrinsics=maps.intrinsics[part])
+        yield first, replace(block, color=maps.color[part].to(maps.device)) if with_color else block
 
 
 def foregrounds(maps: ViewMaps) -> Tensor:
@@ -206,11 +239,12 @@ def own_pairs(maps: ViewMaps) -> Pairs:
     return Pairs(views[:, None], has_foreground.long(), has_foreground.nonzero().flatten(), relative)
 
 
-def related_pairs(maps: ViewMaps, kind: str, max_angle: float, min_overlap: float) -> Pairs:
+def related_pairs(maps: ViewMaps, kind: str, max_angle: float, min_overlap: float, nearest_share: float = 1.0) -> Pairs:
     """Auxiliary candidates per source: optical axes within max_angle (degrees) and overlap above min_overlap.
 
-    The view itself is a candidate once (released code). A view without any other candidate gets the view that overlaps
-    it most, whatever the angle, so that sparse scans still learn from misaligned pairs.
+    The view itself is a candidate once (released code). Of the others the nearest_share stays, rounded up, whose
+    warped images differ least from the source. A view without any other candidate gets the view that overlaps it most,
+    whatever the angle, so that sparse scans still learn from misaligned pairs.
     """
     count, device = maps.count, maps.device
     share = overlaps(maps, kind, max_angle, range(count))
@@ -221,6 +255,8 @@ def related_pairs(maps: ViewMaps, kind: str, max_angle: float, min_overlap: floa
         for source in lonely:
             best = int(wide[source].argmax())
             related[source, best] = bool(wide[source, best] > min_overlap)
+    if nearest_share < 1:
+        related &= _nearest(example_differences(maps, kind, related), related.sum(1), nearest_share)
     candidates = [[source, *related[source].nonzero().flatten().tolist()] for source in range(count)]
     width = max(len(row) for row in candidates)
     auxiliary = torch.tensor([row + [row[0]] * (width - len(row)) for row in candidates], device=device)
@@ -230,3 +266,9 @@ def related_pairs(maps: ViewMaps, kind: str, max_angle: float, min_overlap: floa
     return Pairs(
         auxiliary, number, has_foreground.nonzero().flatten(), relative[:, :, :3].to(torch.float32).contiguous()
     )
+
+
+def _nearest(difference: Tensor, count: Tensor, share: float) -> Tensor:
+    """[V,V] bool: per row of differences, of `count` [V] candidates the share with the least, rounded up."""
+    rank = difference.argsort(1).argsort(1)
+    return rank < (share * count).ceil()[:, None]

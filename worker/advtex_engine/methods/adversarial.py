@@ -91,7 +91,8 @@ def adversarial_no_condition(given: MethodInput) -> tuple[Tensor, list[LossPoint
 def _pairs(given: MethodInput, maps: ViewMaps) -> Pairs:
     if not given.preset.auxiliary:
         return own_pairs(maps)
-    return related_pairs(maps, given.scene.kind, given.preset.max_pair_angle, given.preset.min_pair_overlap)
+    preset = given.preset
+    return related_pairs(maps, given.scene.kind, preset.max_pair_angle, preset.min_pair_overlap, preset.nearest_share)
 
 
 def _run_level(

@@ -174,7 +174,9 @@ def report(arguments: argparse.Namespace, results: Results) -> None:
         rows.append([cell["settings"]["scan"], cell["settings"]["size"], *shown])
     head = ["scan", "size", "real", "real, toned", *TEXTURES, "gradients of real", "gradients of l1"]
     head += ["real over l1", *PARTS]
-    note = "LPIPS against the source photographs, which `l1` and `view_selection` were made of, too. The last five columns"
+    note = (
+        "LPIPS against the source photographs, which `l1` and `view_selection` were made of, too. The last five columns"
+    )
     note += " are ratios of the real examples' to that of `l1` at the same pixels.\n\n"
     write_report(arguments.results / "examples.md", "Real examples", results.cells, note + markdown_table(head, rows))
 

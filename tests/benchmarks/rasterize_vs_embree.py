@@ -55,17 +55,18 @@ def kitchen() -> tuple[Mesh, list[Camera]]:
 
 
 def bumpy_room() -> tuple[Mesh, list[Camera]]:
-    """A box with walls of 5 m that are cut into 81,920 faces and bent by some centimetres, seen from inside."""
+    """A box with walls of 5 m that are cut into FACES faces and bent by some centimetres, seen from inside."""
     ball = trimesh.creation.icosphere(subdivisions=6)
     v_pos = ball.vertices / np.abs(ball.vertices).max(axis=1, keepdims=True) * 2.5
     v_pos += 0.05 * np.sin(7 * v_pos[:, [1, 2, 0]])
+    v_pos, faces = fast_simplification.simplify(np.float32(v_pos), ball.faces, target_count=FACES)
     cameras = []
     for angle in torch.linspace(0.1, 5.0, 5, dtype=torch.float64):
         right = torch.stack([angle.cos(), torch.zeros_like(angle), -angle.sin()])
         forward = torch.stack([angle.sin(), torch.zeros_like(angle), angle.cos()])
         down = torch.tensor([0.0, 1, 0], dtype=torch.float64)
         cameras.append(camera_from(torch.stack([right, down, forward]), torch.tensor([0.3, -0.2, 0.4])))
-    return mesh_of(v_pos, ball.faces), cameras
+    return mesh_of(v_pos, faces), cameras
 
 
 def mesh_of(v_pos: np.ndarray, faces: np.ndarray) -> Mesh:

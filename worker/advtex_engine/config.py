@@ -81,7 +81,7 @@ class Preset:
 PRINTED = Preset(levels=(PyramidLevel(50_000),), start="zero")
 """The paper's recipe to the letter (section 3.2). In 3D it speckles: `PAPER` says what is chosen otherwise, and why."""
 
-# What the paper leaves open, chosen without refined cameras (`tests/benchmarks/paper.py --rows suspects`).
+# What the paper leaves open; `tests/benchmarks/paper.py --rows suspects` tries each choice by itself.
 PAPER = replace(
     PRINTED,
     # Black is far from any texture, and a texel that a tenth of the views show takes 2,000 steps to get away from it;

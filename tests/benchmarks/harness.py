@@ -34,6 +34,7 @@ from advtex_engine.geometry import clean, decimate
 from advtex_engine.ingest import ingest
 from advtex_engine.live import Live
 from advtex_engine.methods import METHODS, MethodInput
+from advtex_engine.methods.adversarial import starting_texture
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.view_selection import select_views
 from advtex_engine.models import load_model
@@ -130,14 +131,12 @@ def run_method(given: MethodInput, method: str) -> Tensor:
 
 
 def started(given: MethodInput) -> MethodInput:
-    """With the start [H,W,3] in [0,1] that the preset has, and views in its tones if that is view selection's."""
-    if given.preset.start != "selection":
-        start = torch.zeros_like(given.means[1]) if given.preset.start == "zero" else given.means[1]
-        return dataclasses.replace(given, start=start)
-    start = select_views(given).texture
+    """With the start [H,W,3] in [0,1] that the preset has, and views in its tones if the preset wants that."""
+    start = select_views(given).texture if given.preset.start == "selection" else starting_texture(given)
     maps = {scale: dataclasses.replace(level, color=level.color.clone()) for scale, level in given.maps.items()}
-    for level in maps.values():
-        tone_views(level, start)
+    if given.preset.toned:
+        for level in maps.values():
+            tone_views(level, start)
     return dataclasses.replace(given, start=start, maps=maps)
 
 

@@ -90,19 +90,30 @@ METHOD_ROWS = {
     )
 }
 
-FROM_MEAN: dict[str, Any] = {"start": "mean", "lr_texture": 1e-3, "l1_target": "auxiliary", "averaging": 0}
+FROM_MEAN: dict[str, Any] = {
+    "start": "mean",
+    "toned": False,
+    "lr_texture": 1e-3,
+    "l1_target": "auxiliary",
+    "nearest_share": 1.0,
+    "averaging": 0,
+}
 """As printed, but for the start: black takes thousands of steps to get away from, and hides all else in short runs."""
 SUSPECTS = {
     "as printed": Row(preset={**FROM_MEAN, "start": "zero"}),
     "from the mean": Row(preset=FROM_MEAN),
     "from the mean, averaged": Row(preset={**FROM_MEAN, "averaging": 2_000}),
+    "from the mean, toned": Row(preset={**FROM_MEAN, "toned": True}),
     "from the mean, half the rate": Row(preset={**FROM_MEAN, "lr_texture": 5e-4}),
     "from the mean, a tenth of the rate": Row(preset={**FROM_MEAN, "lr_texture": 1e-4}),
     "from the mean, L1 to the source": Row(preset={**FROM_MEAN, "l1_target": "source"}),
     "from the mean, fewer texels": Row(preset=FROM_MEAN, options={"texels_per_pixel": 0.8}),
     "from the mean, wider pairs": Row(preset={**FROM_MEAN, "max_pair_angle": 30.0}),
     "from the mean, closer pairs": Row(preset={**FROM_MEAN, "min_pair_overlap": 0.7}),
+    "from the mean, nearest half": Row(preset={**FROM_MEAN, "nearest_share": 0.5}),
     "without averaging": Row(preset={"averaging": 0}),
+    "views as photographed": Row(preset={"toned": False}),
+    "all pairs": Row(preset={"nearest_share": 1.0}),
     "L1 to the auxiliary": Row(preset={"l1_target": "auxiliary"}),
     "from zero": Row(preset={"start": "zero"}),
 }

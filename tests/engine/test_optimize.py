@@ -78,9 +78,8 @@ def test_a_batch_is_what_its_crop_shows() -> None:
     rows, columns = of.maps.slot_map.shape
     texels, weights = bilinear_footprint(uv * torch.tensor([columns, rows]), columns, rows)
     assert torch.equal(of.maps.slot_map.flatten()[texels], batch.slots)
-    visible = batch.visible.flatten()
-    torch.testing.assert_close(batch.weights, weights * visible[:, None])
-    assert visible.mean() > 0.9
+    torch.testing.assert_close(batch.weights, weights * batch.foreground.flatten()[:, None])
+    assert batch.visible.mean() > 0.9
 
 
 def test_a_virtual_camera_moves_its_image_by_a_bounded_shift() -> None:
@@ -223,11 +222,14 @@ def test_pretraining_moves_the_discriminator_alone() -> None:
 def test_l1_is_the_distance_to_what_the_preset_names(target: str) -> None:
     of = optimizer(preset=dataclasses.replace(PRESET, l1_target=target))
     batch = of.draw()
-    named, other = batch.condition, batch.real
+    hidden = torch.ones_like(batch.visible)
+    hidden[..., ::3] = 0
+    batch = dataclasses.replace(batch, visible=batch.visible * hidden)
+    named, other, where = batch.condition, batch.real, batch.foreground
     if target == "auxiliary":
-        named, other = other, named
+        named, other, where = other, named, batch.visible
     assert not torch.equal(named, other)
-    seen = batch.visible.expand_as(named) > 0
+    seen = where.expand_as(named) > 0
     fake = of.sampler.image((of.values.detach()[batch.slots.long()] * batch.weights[..., None]).sum(1)) * 2 - 1
     distance, wrong = ((fake - image)[seen].abs().mean() for image in (named, other))
     found = float(of.play(batch).l1.detach())

@@ -306,14 +306,14 @@ class Twin:
         return 2 * (self.texture[texels] * weights[..., None]).sum(2) - 1
 
     def play(self, shown: Example, index: int, l1_target: str) -> Played:
-        real, fake = torch.tensor(shown.real), self.render(shown)
+        source, real, fake = torch.tensor(shown.condition), torch.tensor(shown.real), self.render(shown)
         judged, learned = (torch.tensor(each) for each in patches(shown))
         of_real, of_fake = (logits(self.parameters, judged_input(shown, image)) for image in (real, fake))
         D_real, D_fake = of_real.sigmoid(), of_fake.sigmoid()
         L_c = D_real[learned].log().mean() + (1 - D_fake[learned]).log().mean()
         adversarial = -D_fake[judged].log().mean()
-        target = {"auxiliary": real, "source": torch.tensor(shown.condition)}[l1_target]
-        L_L1 = (target - fake)[torch.tensor(shown.visible)].abs().mean()
+        target, seen = {"auxiliary": (real, shown.visible), "source": (source, shown.foreground)}[l1_target]
+        L_L1 = (target - fake)[torch.tensor(seen)].abs().mean()
         objective = adversarial + 10 * 0.8 ** (index // 1000) * L_L1
         (of_texture,) = torch.autograd.grad(objective, [self.texture], retain_graph=True)
         of_network = torch.autograd.grad(-L_c, self.parameters)

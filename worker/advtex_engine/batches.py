@@ -91,7 +91,7 @@ class PairSampler:
             foreground=self.image(foreground.to(torch.float32)[:, None]),
             visible=self.image(visible.to(torch.float32)[:, None]),
             slots=slots,
-            weights=weights * visible[:, None],
+            weights=weights * foreground[:, None],
         )
 
     def choose(self) -> Choice:

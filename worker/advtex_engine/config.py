@@ -26,6 +26,7 @@ class Preset:
 
     levels            coarse-to-fine schedule; one level for everything but `preview`
     start             "zero" (black, as printed), "mean" (the projected mean) or "selection" (one view per face)
+    toned             the views' wide averages are made the start's (paper: views as photographed)
     pretraining       first steps, counted in `levels`, in which the discriminator learns alone
     lr_texture        1e-3, Adam; colors in [0, 1]. Adam's step is as long however rarely a view shows the texel and
                       however faint its gradient is: it is noise that accumulates while nothing holds it back
@@ -33,8 +34,8 @@ class Preset:
     lr_end            share of both at the last step, reached in a straight line (paper: 1, no decay)
     beta1             0.5
     l1_weight         lambda = 10 at the start
-    l1_target         "auxiliary" (the warped auxiliary image: the paper's text), "source" (the source image: its
-                      supplement A) or "start" (the start's own render)
+    l1_target         "auxiliary" (the warped auxiliary image, where that view sees: the paper's text), "source" (the
+                      source image, wherever it shows the mesh: its supplement A) or "start" (the start's own render)
     l1_decay          lambda is multiplied by this `l1_decays` times over the run (paper: 0.8 every 1,000 of 50,000)
     feature_weight    of the distance between what the discriminator's layers respond to the render and to the real
                       example (paper: 0); tolerant to shifts as they are, it averages less than L1 does
@@ -52,6 +53,7 @@ class Preset:
 
     levels: tuple[PyramidLevel, ...]
     start: Literal["zero", "mean", "selection"]
+    toned: bool = False
     pretraining: int = 0
     lr_texture: float = 1e-3
     lr_discriminator: float = 1e-4
@@ -87,6 +89,10 @@ PAPER = replace(
     # Black is far from any texture, and a texel that a tenth of the views show takes 2,000 steps to get away from it;
     # the discriminator meets nothing but unfinished textures meanwhile.
     start="mean",
+    # Frames differ in exposure, and a texture has but one tone. Where a render is told from the real example by its
+    # tone, the texture can give no answer: on a kitchen it ended at 1.57 times the LPIPS of the texture of least L1
+    # distance, and at .79 times that with views in one tone.
+    toned=True,
     # In the paper's case of two dimensions every step shows every texel. Here a view shows a tenth of them: Adam's
     # moments, means over all steps, make a step about 1 / sqrt(.1) times the rate for each time that the texel is seen.
     lr_texture=1e-4,
@@ -104,6 +110,7 @@ PAPER = replace(
 STANDARD = Preset(
     levels=(PyramidLevel(1_500),),
     start="selection",
+    toned=True,
     pretraining=150,
     lr_texture=4e-4,
     lr_discriminator=8e-4,

@@ -82,10 +82,10 @@ class _L1(torch.autograd.Function):
         return into, None, None
 
 
-def l1_loss(fake: Tensor, real: Tensor, visible: Tensor) -> Tensor:
+def l1_loss(fake: Tensor, real: Tensor, seen: Tensor) -> Tensor:
     """`losses.l1_loss` of images [1,3,H,W]; differentiable in `fake` only."""
     assert fake.shape == real.shape and fake.shape[:2] == (1, 3)
-    rows = [image.permute(0, 2, 3, 1).reshape(-1, image.shape[1]).contiguous() for image in (fake, real, visible)]
+    rows = [image.permute(0, 2, 3, 1).reshape(-1, image.shape[1]).contiguous() for image in (fake, real, seen)]
     mean: Tensor = _L1.apply(rows[0], rows[1].detach(), rows[2])  # type: ignore[no-untyped-call]
     return mean
 

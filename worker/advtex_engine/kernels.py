@@ -173,7 +173,7 @@ def draw(
         slot = tl.load(slot_map + first + (tap // 2) * TEXTURE_WIDTH + tap % 2, mask=live, other=0)
         weight = (right if tap % 2 else 1 - right) * (down if tap // 2 else 1 - down)
         tl.store(slots + pixel * 4 + tap, tl.maximum(slot, 0), mask=live)
-        tl.store(weights + pixel * 4 + tap, weight * seen, mask=live)
+        tl.store(weights + pixel * 4 + tap, tl.where(distance > 0, weight, 0.0), mask=live)
 
 
 @triton.jit

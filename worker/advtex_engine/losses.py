@@ -81,9 +81,9 @@ def judge(real: Tensor, fake: Tensor, shares: Tensor, pretraining: Tensor) -> Ve
     return Verdict(of_discriminator, adversarial, ahead)
 
 
-def l1_loss(fake: Tensor, real: Tensor, visible: Tensor) -> Tensor:
-    """Mean absolute difference to an image where the auxiliary view sees the surface; images [B,3,H,W]."""
-    return masked_mean((fake - real).abs(), visible)
+def l1_loss(fake: Tensor, real: Tensor, seen: Tensor) -> Tensor:
+    """Mean absolute difference of images [B,3,H,W] where seen [B,1,H,W] is 1."""
+    return masked_mean((fake - real).abs(), seen)
 
 
 class _MeanDifference(torch.autograd.Function):

@@ -210,7 +210,7 @@ class AdversarialOptimizer:
         if self.start is not None:
             return self.operations.l1_loss(fake, self._render(self.start, batch), batch.visible)
         if self.preset.l1_target == "source":
-            return self.operations.l1_loss(shown.fake, batch.condition, shown.visible)
+            return self.operations.l1_loss(fake, batch.condition, batch.foreground)
         return self.operations.l1_loss(shown.fake, shown.real, shown.visible)
 
     def _offsets(self, batch: Batch, fake: Tensor) -> Tensor:

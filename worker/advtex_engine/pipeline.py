@@ -35,6 +35,7 @@ from advtex_engine.limits import Budget
 from advtex_engine.live import Live
 from advtex_engine.memory import Workload, held_bytes
 from advtex_engine.methods import METHODS, MethodInput, require
+from advtex_engine.methods.adversarial import starting_texture
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.view_selection import select_views
 from advtex_engine.monitor import Monitor
@@ -124,11 +125,12 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
         live = Live(scene, atlas, monitor)
         given = MethodInput(scene, atlas, maps, means, preset, config, monitor, folder, live)
         given = replace(given, on_device=budget.limits.on_device)
-        if preset.start == "selection" and config.method.startswith("adversarial"):
-            start = _selected_start(given)
-            given = replace(given, start=start)
-            for level in maps.values():
-                tone_views(level, start)
+        if config.method.startswith("adversarial"):
+            if preset.start == "selection":
+                given = replace(given, start=_selected_start(given))
+            if preset.toned:
+                for level in maps.values():
+                    tone_views(level, starting_texture(given))
     stages.save()
     held = held_bytes(maps.values(), device) + sum(mean.nbytes for mean in means.values())
     held += 0 if given.start is None else given.start.nbytes

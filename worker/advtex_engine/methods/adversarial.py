@@ -47,7 +47,7 @@ def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     run = _Run(saved["level"], saved["step"], saved["losses"]) if saved else _Run(0, 0, [])
     if saved:
         given.live.quality = saved["quality"]
-    start = _start(given)
+    start = starting_texture(given)
     texture = start
     for number, level in enumerate(preset.levels):
         if number < run.level:
@@ -126,8 +126,8 @@ def _run_level(
     given.facts["step"] = stepper.describe()
 
 
-def _start(given: MethodInput) -> Tensor:
-    """The dense start [H,W,3] in [0,1], at full size."""
+def starting_texture(given: MethodInput) -> Tensor:
+    """What the run starts from: dense [H,W,3] in [0,1], at full size."""
     if given.start is not None:
         return given.start
     mean = given.means[1]

@@ -9,8 +9,10 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import datetime
+import fcntl
 import json
 import math
+import os
 import shlex
 import sys
 import time
@@ -186,11 +188,18 @@ def score_model(
 
 
 class Results:
-    """Cells of a benchmark in a JSON file: each its settings, its scores and how it was made."""
+    """Cells of a benchmark in a JSON file: each its settings, its scores and how it was made.
+
+    Several processes may fill one file.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.cells: list[dict[str, Any]] = json.loads(path.read_text())["cells"] if path.exists() else []
+        self.cells = self._read()
+
+    def _read(self) -> list[dict[str, Any]]:
+        cells: list[dict[str, Any]] = json.loads(self.path.read_text())["cells"] if self.path.exists() else []
+        return cells
 
     def find(self, settings: Mapping[str, Any]) -> dict[str, Any] | None:
         """The cell with exactly these settings."""
@@ -200,9 +209,14 @@ class Results:
         """Keeps a cell and writes the file, so that a stop loses no more than the cell in the making."""
         day = datetime.datetime.now(datetime.UTC).date().isoformat()
         made = {"date": day, "command": command(), "seconds": round(seconds, 1)}
-        self.cells.append({"settings": dict(settings), "scores": dict(scores), **made})
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(self.path, json.dumps({"cells": self.cells}, indent=1).encode() + b"\n")
+        folder = os.open(self.path.parent, os.O_RDONLY)
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX)
+            self.cells = [*self._read(), {"settings": dict(settings), "scores": dict(scores), **made}]
+            write_atomically(self.path, json.dumps({"cells": self.cells}, indent=1).encode() + b"\n")
+        finally:
+            os.close(folder)
         shown = ", ".join(f"{name} {value:.4g}" for name, value in scores.items())
         print(f"{' '.join(str(value) for value in settings.values())}: {shown}; {seconds:.0f} s", flush=True)
 

@@ -105,7 +105,8 @@ def test_draws_of_many_runs_follow_the_even_distribution() -> None:
     seen: Counter[tuple[int, int]] = Counter()
     for seed in range(runs):
         streamed = StreamedViews(maps, all_pairs, 2 * 2 * (1 + AUXILIARIES), seed)
-        streamed.advance((0, 5, 20)[seed % 3])
+        for _ in range((0, 5, 20)[seed % 3]):
+            streamed.advance(1)
         chances = drawn_from(streamed.pairs, streamed.held)
         random = torch.tensor([float(chance) for chance in chances.values()]).multinomial(1, generator=generator)
         seen[list(chances)[int(random)]] += 1
@@ -189,10 +190,22 @@ def test_a_run_that_goes_on_draws_the_same(stop: int, launch: int) -> None:
     assert all(torch.equal(one, other) for one, other in zip(whole, resumed, strict=True))
 
 
+@pytest.mark.parametrize("on_device", [LEAST_VIEWS, 16, 32])
+def test_launches_of_many_steps_draw_from_all_sources_alike(on_device: int) -> None:
+    streamed = StreamedViews(views(), pairs(), on_device, 3)
+    launches, drawn = 60, Counter[int]()
+    for _ in range(launches):
+        drawn.update(streamed_sources(streamed))
+        streamed.advance(20)
+    assert set(drawn) == set(SOURCES)
+    assert max(drawn.values()) - min(drawn.values()) <= 20 // streamed.block_views + 2
+
+
 def test_a_smaller_block_goes_on_with_the_sources_that_are_left() -> None:
     maps, all_pairs = views(), pairs()
     first = StreamedViews(maps, all_pairs, 32, 1)
-    first.advance(first.block_views + 5)
+    first.advance(first.block_views)
+    first.advance(5)
     smaller = StreamedViews(maps, all_pairs, 16, 1)
     smaller.load_state_dict(first.state_dict())
     places = 4 + 5 // 4  # groups used up

@@ -1,13 +1,14 @@
 """Stage caches and checkpoints of one run, in its work folder.
 
 Every file is written to a temporary name, fsynced and renamed: after a kill a file is whole or absent. Each carries the
-run's fingerprint (scan and options); a file of another run is ignored.
+run's fingerprint (scan, options, numbers of the presets and FORMAT); a file of another run or of another version of the
+engine is ignored, as is one that is broken.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -16,7 +17,10 @@ from torch import Tensor
 
 from advtex_engine.files import atomic_file
 from advtex_engine.monitor import Monitor
+from advtex_engine.shortage import memory_problem
 
+FORMAT = 1
+"""Of what the files hold, to be raised with every change of it (`tests/engine/test_work_format.py` compares)."""
 CHECKPOINT = "checkpoint"
 MAX_SHARE = 0.01
 """A checkpoint is due while saving took less than this of the run's time. It costs about as much as all that was saved
@@ -26,8 +30,9 @@ before it at most, so that afterwards the share is within twice this: the promis
 class WorkFolder:
     """Named dictionaries of tensors and plain values below `path`, tied to `fingerprint`.
 
-    save: atomic and durable, then reported to the monitor; OSError when the disk is full. load: None when absent,
-    unreadable or of another run; tensors that are `mapped` lie in the file and take memory only while they are read.
+    save: atomic and durable, then reported to the monitor; OSError when the disk is full. load: None when absent, and,
+    with a note to the monitor, when unreadable, of another run or without one of the names that are `needed`; tensors
+    that are `mapped` lie in the file and take memory only while they are read.
     seconds: spent in `save` so far. earlier_seconds: what attempts before this one spent on the optimization, as far
     as the checkpoint that was loaded goes.
     """
@@ -35,6 +40,7 @@ class WorkFolder:
     def __init__(self, path: Path, fingerprint: str, monitor: Monitor) -> None:
         self.path, self.fingerprint, self.monitor = path, fingerprint, monitor
         self.seconds = self.earlier_seconds = 0.0
+        self._told = False
         path.mkdir(parents=True, exist_ok=True)
 
     def save(self, name: str, content: Mapping[str, Any]) -> None:
@@ -49,15 +55,30 @@ class WorkFolder:
         self.monitor.checkpointed((target,))
         self.seconds += time.monotonic() - started
 
-    def load(self, name: str, *, mapped: bool = False) -> dict[str, Any] | None:
+    def load(self, name: str, needed: Iterable[str] = (), *, mapped: bool = False) -> dict[str, Any] | None:
         target = self.path / f"{name}.pt"
         if not target.exists():
             return None
         try:
-            content: dict[str, Any] = torch.load(target, map_location="cpu", weights_only=True, mmap=mapped)
-        except (OSError, RuntimeError, EOFError, ValueError):
+            content = torch.load(target, map_location="cpu", weights_only=True, mmap=mapped)
+        except Exception as error:  # of nearly any kind, by what is broken
+            if memory_problem(error) is not None:
+                raise
+            self._note(name, "cannot be read")
             return None
-        return content if content.get("fingerprint") == self.fingerprint else None
+        if not isinstance(content, dict) or content.get("fingerprint") != self.fingerprint:
+            self._note(name, "was made of another scan, with other options or by another version")
+            return None
+        if missing := set(needed) - set(content):
+            self._note(name, f"lacks {', '.join(sorted(missing))}")
+            return None
+        return content
+
+    def _note(self, name: str, reason: str) -> None:
+        """One line for a run: what else it finds goes without saying."""
+        if not self._told:
+            self.monitor.note(f"{name}.pt in the work folder {reason}: what it held is made anew")
+        self._told = True
 
     def clear(self) -> None:
         """Removes what an earlier run left."""
@@ -105,9 +126,9 @@ class Checkpoints:
         self._started = self._last = time.monotonic()
         self._saving = 0.0
 
-    def load(self) -> dict[str, Any] | None:
-        """What `save` was given, of the work folder's checkpoint; None without one."""
-        saved = self.work.load(CHECKPOINT)
+    def load(self, *needed: str) -> dict[str, Any] | None:
+        """What `save` was given, with these names at least, of the work folder's checkpoint; None without one."""
+        saved = self.work.load(CHECKPOINT, ("seconds", *needed))
         if saved is None or saved.get("steps", self.steps) != self.steps:
             return None
         self.work.earlier_seconds = saved["seconds"]

@@ -58,7 +58,7 @@ class Budget:
     def __init__(self, device: torch.device, config: TextureConfig, folder: WorkFolder, monitor: WarningKeeper) -> None:
         self.device, self.config, self.folder, self.monitor = device, config, folder, monitor
         self.limits, self.measures = Limits(), list[dict[str, str]]()
-        saved = folder.load("limits")
+        saved = folder.load("limits", ("limits", "measures"))
         if saved is not None:
             crop = saved["limits"]["max_crop"]
             self.limits = Limits(**{**saved["limits"], "max_crop": crop and tuple(crop)})

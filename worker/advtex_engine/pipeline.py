@@ -21,7 +21,7 @@ from advtex_engine.atlas import begin_charts, build_atlas
 from advtex_engine.cameras import scaled_camera
 from advtex_engine.capture import FrameStore
 from advtex_engine.chart_cache import ChartMaker, charts_folder
-from advtex_engine.checkpoint import WorkFolder
+from advtex_engine.checkpoint import FORMAT, WorkFolder
 from advtex_engine.config import PRESETS, Preset, PyramidLevel, TextureConfig
 from advtex_engine.curves import curves
 from advtex_engine.deep_check import judge
@@ -41,7 +41,7 @@ from advtex_engine.methods.view_selection import select_views
 from advtex_engine.monitor import Monitor
 from advtex_engine.optimize import native_bfloat16
 from advtex_engine.preparation import MeshPreparation
-from advtex_engine.refine import apply_refinement, refine_cameras, refinement_from_dict, refinement_to_dict
+from advtex_engine.refine import Refinement, apply_refinement, refine_cameras, refinement_from_dict, refinement_to_dict
 from advtex_engine.registration import MAX_FRAMES, register_mesh
 from advtex_engine.report import (
     Stages,
@@ -63,6 +63,8 @@ from advtex_engine.toning import tone_views
 from advtex_engine.views import ViewMaps, build_view_maps
 
 BORDERS = 1.25  # texels that views touch, of those that the charts cover
+OF_MESH, OF_ATLAS = ("t_pos_idx", "v_uv", "t_uv_idx"), ("width", "height", "source", "charts", "pages")
+"""What the cache of an atlas holds: the mesh's positions are the scene's."""
 NO_RESULT = ("device", "checkpoint_seconds", "memory_bytes")  # options that the result does not depend on
 
 
@@ -182,7 +184,7 @@ def resolve_preset(config: TextureConfig, device: torch.device) -> Preset:
 
 
 def fingerprint(scan: Path, config: TextureConfig) -> str:
-    """Identifies a run: the state of the scan's files, and every option that changes the result.
+    """Identifies a run: the state of the scan's files, and every option and number that changes the result.
 
     A zip keeps its fingerprint wherever it is copied; a folder keeps it where copies keep the files' times.
     Raises ScanError for what cannot be opened.
@@ -190,7 +192,8 @@ def fingerprint(scan: Path, config: TextureConfig) -> str:
     with opened(scan) as archive:
         files = archive.stamps()
     options = {key: value for key, value in asdict(config).items() if key not in NO_RESULT}
-    content = {"files": files, "options": options}
+    presets = {name: asdict(preset) for name, preset in PRESETS.items()}
+    content = {"format": FORMAT, "files": files, "options": options, "presets": presets}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
@@ -198,7 +201,7 @@ def _load_scene(
     scan: Path, config: TextureConfig, folder: WorkFolder, stages: Stages, device: torch.device, charts: ChartMaker
 ) -> tuple[Scene, dict[str, Any]]:
     """The scene, mesh and views within their budgets, and the report's parts about how it was made."""
-    saved = folder.load("scene")
+    saved = folder.load("scene", (*Scene.__dataclass_fields__, "made"))
     if saved is not None:
         stages.restore("ingest", "conventions", "fusion", "geometry")
         return scene_from_dict(saved), saved["made"]
@@ -246,7 +249,7 @@ def _refine(
     """
     if not config.refines:
         return scene, None
-    saved = folder.load("refinement")
+    saved = folder.load("refinement", Refinement.__dataclass_fields__)
     if saved is not None:
         stages.restore("refinement")
         refinement = refinement_from_dict(saved)
@@ -293,26 +296,15 @@ def _fitting_atlas(scene: Scene, budget: Budget, stages: Stages, charts: ChartMa
 def _load_atlas(
     scene: Scene, config: TextureConfig, folder: WorkFolder, stages: Stages, monitor: Monitor, charts: ChartMaker
 ) -> Atlas:
-    saved = folder.load("atlas")
+    saved = folder.load("atlas", (*OF_MESH, *OF_ATLAS))
     if saved is not None:
         stages.restore("atlas")
-        mesh = Mesh(scene.mesh.v_pos, saved["t_pos_idx"], saved["v_uv"], saved["t_uv_idx"])
-        return Atlas(mesh, saved["width"], saved["height"], saved["source"], saved["charts"], saved["pages"])
+        mesh = Mesh(scene.mesh.v_pos, *(saved[name] for name in OF_MESH))
+        return Atlas(mesh, **{name: saved[name] for name in OF_ATLAS})
     with stages.run("atlas"):
         atlas = build_atlas(scene.mesh, [view.camera for view in scene.views], config, monitor, charts)
-    folder.save(
-        "atlas",
-        {
-            "t_pos_idx": atlas.mesh.t_pos_idx,
-            "v_uv": atlas.mesh.v_uv,
-            "t_uv_idx": atlas.mesh.t_uv_idx,
-            "width": atlas.width,
-            "height": atlas.height,
-            "source": atlas.source,
-            "charts": atlas.charts,
-            "pages": atlas.pages,
-        },
-    )
+    saved = {name: getattr(atlas.mesh, name) for name in OF_MESH}
+    folder.save("atlas", saved | {name: getattr(atlas, name) for name in OF_ATLAS})
     stages.save()
     return atlas
 
@@ -335,7 +327,7 @@ def _view_maps(
     allocate = host_allocator(device, folder.path) if on_host else None
     with stages.run("view_maps"):
         for scale in sorted({1, *(level.scale for level in preset.levels)}):
-            saved = folder.load(f"view_maps_{scale}", mapped=on_host)
+            saved = folder.load(f"view_maps_{scale}", ViewMaps.__dataclass_fields__, mapped=on_host)
             if saved is not None:
                 level = ViewMaps(**{key: saved[key] for key in ViewMaps.__dataclass_fields__})
                 # A copy on the host as well: what is written into a mapped cache would stay in memory.
@@ -352,7 +344,7 @@ def _view_maps(
 
 def _selected_start(given: MethodInput) -> Tensor:
     """The texture by view selection; from the work folder when it is there."""
-    saved = given.work.load("initial_texture")
+    saved = given.work.load("initial_texture", ("texture",))
     if saved is not None:
         texture: Tensor = saved["texture"].to(given.means[1])
         return texture

@@ -96,7 +96,7 @@ class Stages:
     def __init__(self, monitor: WarningKeeper, folder: WorkFolder, device: torch.device) -> None:
         self.monitor, self.folder, self.device = monitor, folder, device
         self.records: list[dict[str, Any]] = []
-        saved = folder.load("stages")
+        saved = folder.load("stages", ("records", "warnings"))
         self._saved = {record["stage"]: record for record in saved["records"]} if saved else {}
         self._saved_warnings = saved["warnings"] if saved else []
 

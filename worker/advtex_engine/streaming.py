@@ -2,7 +2,8 @@
 
 group: a source view with up to AUXILIARIES of its candidates. block: the groups that steps draw from at one time. The
 device holds two blocks: steps draw from one while the next is copied into the other, one view per step, so a block
-lasts as many steps as it has views. All tensors keep their addresses, so that a captured CUDA graph stays valid.
+lasts as many steps as it has views, and on to the end of a launch of several steps. All tensors keep their addresses,
+so that a captured CUDA graph stays valid.
 
 Why nothing is biased: sources come in random order, all of them before any comes again, and each brings candidates
 drawn evenly from all of its own. At every single step, each source is therefore equally likely to be the one that is
@@ -207,12 +208,15 @@ class StreamedViews:
         self._start(0)
 
     def advance(self, steps: int) -> None:
-        """Copies a view of the next block per step, and changes to it when this one has lasted its steps."""
-        for _ in range(steps):
-            self._copy(self._used)
-            self._used += 1
-            if self._used == self.block_views:
-                self._change()
+        """Copies a view of the next block per step, and changes to it when this one has lasted its steps.
+
+        Steps that were taken at once drew from one block: the next one is not passed over, however many they were.
+        """
+        for index in range(self._used, min(self._used + steps, self.block_views)):
+            self._copy(index)
+        self._used += steps
+        if self._used >= self.block_views:
+            self._change()
 
     def state_dict(self) -> dict[str, int]:
         """place: of the block's first group. used: steps taken from it. groups: in a block."""

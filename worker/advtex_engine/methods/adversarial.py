@@ -43,7 +43,7 @@ def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     discriminator = PatchDiscriminator(torch.Generator().manual_seed(given.config.seed)).to(device)
     generator = torch.Generator(device).manual_seed(given.config.seed)
     checkpoints = Checkpoints(given.work, given.config.checkpoint_seconds, preset.steps)
-    saved = checkpoints.load()
+    saved = checkpoints.load("level", "step", "losses", "quality", "optimizer", "views")
     run = _Run(saved["level"], saved["step"], saved["losses"]) if saved else _Run(0, 0, [])
     if saved:
         given.live.quality = saved["quality"]

@@ -42,7 +42,7 @@ def descend(
     total = torch.zeros((), device=values.device)
     first, losses = 0, list[LossPoint]()
     checkpoints = Checkpoints(given.work, given.config.checkpoint_seconds, steps)
-    saved = checkpoints.load()
+    saved = checkpoints.load("step", "losses", "quality", "values", "total", "adam", "generator", "views")
     if saved is not None:
         first, losses = saved["step"], saved["losses"]
         given.live.quality = saved["quality"]

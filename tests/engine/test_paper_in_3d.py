@@ -12,7 +12,6 @@ from advtex_engine.config import PAPER, PRESETS, TextureConfig
 from advtex_engine.pipeline import texture_scan
 from advtex_engine.synthesize import compare_to_truth, synthesize
 
-
 STEPS = 800
 
 

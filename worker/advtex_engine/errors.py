@@ -4,6 +4,7 @@ EngineError
 ├── ScanError       the scan cannot be textured; `findings` say what and how to mend it
 ├── OptionError     an option is out of bounds or unknown
 ├── MemoryShortage  the device has too little memory, also for the least that can be done
+├── Diverged        the losses or the texture are no longer finite
 └── Stopped         a stop was asked for; a checkpoint is on disk
 """
 
@@ -40,6 +41,10 @@ class OptionError(EngineError):
 
 class MemoryShortage(EngineError):
     """The device has too little memory, and nothing is left to be made smaller."""
+
+
+class Diverged(EngineError):
+    """The losses or the texture are no longer finite, also with half the learning rates."""
 
 
 class Stopped(EngineError):

@@ -7,7 +7,6 @@ black: leaving difficult faces out does not help. Outside of these pixels both i
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +19,7 @@ from torch import Tensor
 from advtex_engine.config import TextureConfig
 from advtex_engine.errors import EngineError, Problem, ScanError
 from advtex_engine.export import TO_Y_UP
-from advtex_engine.files import write_atomically
+from advtex_engine.files import json_text, write_atomically
 from advtex_engine.ingest import load_scene
 from advtex_engine.memory import available_memory
 from advtex_engine.metrics import METRICS, nearest_patch_loss
@@ -217,7 +216,7 @@ def score_views(atlas: Atlas, texture: Tensor, views: Sequence[View], lpips: Lpi
 def write_json(path: Path, evaluation: Evaluation, described: dict[str, Any]) -> None:
     """described: what was evaluated, put before the scores."""
     content = {**described, **vars(evaluation)}
-    write_atomically(path, json.dumps(content, indent=1, default=str).encode() + b"\n")
+    write_atomically(path, json_text(content, indent=1).encode() + b"\n")
 
 
 def _load_views(scan: Path, config: TextureConfig, monitor: Monitor) -> Scene:

@@ -1,7 +1,8 @@
-"""Files that are either whole or absent, whatever stops the process."""
+"""Files that are either whole or absent, whatever stops the process, and JSON that every reader takes."""
 
 from __future__ import annotations
 
+import json
 import os
 import tempfile
 import threading
@@ -11,6 +12,12 @@ from pathlib import Path
 from typing import BinaryIO
 
 _masking = threading.Lock()
+
+
+def json_text(data: object, indent: int | None = None) -> str:
+    """What JSON has no word for becomes text, but numbers that are not finite become null."""
+    finite = json.loads(json.dumps(data, default=str), parse_constant=lambda _constant: None)
+    return json.dumps(finite, allow_nan=False, indent=indent)
 
 
 @contextmanager

@@ -271,6 +271,10 @@ class AdversarialOptimizer:
         self._summed = 0
         return dict(zip(LOSS_NAMES, means, strict=True))
 
+    def finite(self) -> bool:
+        """Whether the texture and the discriminator are (waits for the device)."""
+        return bool(torch.stack([part.isfinite().all() for part in (self.values, *self.parameters)]).all())
+
     def state_dict(self) -> dict[str, Any]:
         """All that decides the remaining steps."""
         state: dict[str, Any] = {

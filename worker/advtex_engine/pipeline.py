@@ -26,7 +26,7 @@ from advtex_engine.config import PRESETS, Preset, PyramidLevel, TextureConfig
 from advtex_engine.curves import curves
 from advtex_engine.deep_check import judge
 from advtex_engine.devices import choose_device as choose_device
-from advtex_engine.errors import MemoryShortage, OptionError
+from advtex_engine.errors import Diverged, MemoryShortage, OptionError
 from advtex_engine.export import export_model
 from advtex_engine.fusion import fuse
 from advtex_engine.gallery import write_gallery
@@ -140,6 +140,8 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
     with stages.run("optimization"):
         texture, losses = METHODS[config.method](given)
         budget.folder.earlier_seconds = folder.earlier_seconds
+    if not bool(texture.isfinite().all()):
+        raise Diverged(f"the texture of the method {config.method} is not finite everywhere; choose another method")
     memory = budget.report(work, stages.records[-1], held)
     with stages.run("dilation"):
         texture = fill_holes(texture, maps[1].slot_map >= 0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import json
 import platform
 import resource
 import sys
@@ -20,7 +19,7 @@ from torch import Tensor
 from advtex_engine.checkpoint import WorkFolder
 from advtex_engine.errors import Problem, Stopped
 from advtex_engine.evaluate import configured_lpips, score_views
-from advtex_engine.files import write_atomically
+from advtex_engine.files import json_text, write_atomically
 from advtex_engine.monitor import Glimpse, Monitor
 from advtex_engine.scene import Atlas, Camera, Mesh, Scene, View
 
@@ -183,7 +182,7 @@ def heldout_scores(scene: Scene, atlas: Atlas, texture: Tensor, mean: Tensor) ->
 
 def write_report(out: Path, report: Mapping[str, Any]) -> Path:
     path = out / "report.json"
-    write_atomically(path, json.dumps(report, indent=1, default=str).encode() + b"\n")
+    write_atomically(path, json_text(report, indent=1).encode() + b"\n")
     return path
 
 

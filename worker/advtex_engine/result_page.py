@@ -11,7 +11,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from advtex_engine.files import write_atomically
+from advtex_engine.files import json_text, write_atomically
 
 TEMPLATE = Path(__file__).with_name("result_page.html")
 LEFT_OUT = ("losses",)  # of the report: the curves have them
@@ -36,10 +36,5 @@ def write_page(out: Path, report: Mapping[str, Any], files: Sequence[Path]) -> P
 
 
 def embedded(data: object) -> str:
-    """JSON that may stand in a script element, whatever names a scan brings: no character opens or ends a tag.
-
-    Browsers' JSON has no NaN: it becomes null.
-    """
-    finite = json.loads(json.dumps(data, default=str), parse_constant=lambda _constant: None)
-    text = json.dumps(finite, allow_nan=False)
-    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
+    """JSON that may stand in a script element, whatever names a scan brings: no character opens or ends a tag."""
+    return json_text(data).replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -11,7 +13,7 @@ from torch import Tensor
 
 from advtex_engine.checkpoint import Checkpoints
 from advtex_engine.discriminator import PatchDiscriminator
-from advtex_engine.errors import Stopped
+from advtex_engine.errors import Diverged, Problem, Stopped
 from advtex_engine.graphed import Stepper
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.methods.mean import dense_texture
@@ -19,32 +21,65 @@ from advtex_engine.optimize import AdversarialOptimizer
 from advtex_engine.streaming import PairViews, pair_views
 from advtex_engine.views import Pairs, ViewMaps, own_pairs, related_pairs
 
+NEEDED = ("level", "step", "losses", "quality", "halved", "optimizer", "views")
+"""What a checkpoint holds."""
 HISTORY_POINTS = 200  # loss means kept for the report and shown as progress
 
 
 @dataclass
 class _Run:
-    """Where the run stands: pyramid level, global step, losses so far."""
+    """Where the run stands: pyramid level, global step, losses so far, and whether it goes at half the rates."""
 
     level: int
     step: int
     losses: list[LossPoint]
+    halved: bool
 
 
 def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     """Optimizes the texture; goes on from the work folder's checkpoint when there is one.
 
     Returns the dense texture [H,W,3] float32 in [0,1] and the loss history. Raises Stopped, after a checkpoint, when
-    the monitor asks for it. On a CPU the result does not depend on whether and where the run was interrupted.
+    the monitor asks for it. On a CPU the result does not depend on whether and where the run was interrupted. A run
+    that diverges goes back to its last checkpoint once, with half the learning rates, and warns; then Diverged.
     """
+    checkpoints = Checkpoints(given.work, given.config.checkpoint_seconds, given.preset.steps)
+    saved = checkpoints.load(*NEEDED)
+    try:
+        return _optimized(given, checkpoints, saved, halved=saved is not None and saved["halved"])
+    except _FirstDivergence as error:
+        step = error.step
+    # Not in the handler: the error's traceback holds the run that diverged.
+    saved = checkpoints.load(*NEEDED)
+    given.monitor.warning(
+        Problem(
+            "diverged",
+            f"step {step} of {given.preset.steps}",
+            "the losses or the texture were no longer finite; the run went on from"
+            f" step {saved['step'] if saved else 0} with half the learning rates",
+            "compare the result with that of another preset or seed",
+        )
+    )
+    return _optimized(given, checkpoints, saved, halved=True)
+
+
+class _FirstDivergence(Exception):
+    def __init__(self, step: int) -> None:
+        self.step = step
+
+
+def _optimized(
+    given: MethodInput, checkpoints: Checkpoints, saved: dict[str, Any] | None, *, halved: bool
+) -> tuple[Tensor, list[LossPoint]]:
+    """From the checkpoint that was `saved`, or from the start."""
     preset = given.preset
+    if halved:
+        preset = replace(preset, lr_texture=preset.lr_texture / 2, lr_discriminator=preset.lr_discriminator / 2)
     device = given.maps[1].device
     # Weights are drawn on the CPU, so that a run starts from the same discriminator on every device.
     discriminator = PatchDiscriminator(torch.Generator().manual_seed(given.config.seed)).to(device)
     generator = torch.Generator(device).manual_seed(given.config.seed)
-    checkpoints = Checkpoints(given.work, given.config.checkpoint_seconds, preset.steps)
-    saved = checkpoints.load("level", "step", "losses", "quality", "optimizer", "views")
-    run = _Run(saved["level"], saved["step"], saved["losses"]) if saved else _Run(0, 0, [])
+    run = _Run(saved["level"], saved["step"], saved["losses"], halved) if saved else _Run(0, 0, [], halved)
     if saved:
         given.live.quality = saved["quality"]
     start = starting_texture(given)
@@ -112,6 +147,7 @@ def _run_level(
         views.advance(run.step - before)
         if run.step // every > before // every or run.step == end:
             losses = optimizer.drain_losses()
+            _check(optimizer, losses, run, total)
             run.losses.append({"step": run.step, **losses})
             given.monitor.progress(run.step, total, losses)
         if run.step == total or given.live.due():
@@ -119,11 +155,25 @@ def _run_level(
             given.live.show(run.step, optimizer.maps, optimizer.result, mean, run.losses)
         stop = given.monitor.stop_requested()
         if stop or checkpoints.due():
+            _check(optimizer, {}, run, total)
             state = {"level": run.level, "step": run.step, "losses": run.losses, "quality": given.live.quality}
+            state["halved"] = run.halved
             checkpoints.save({**state, "optimizer": optimizer.state_dict(), "views": views.state_dict()})
         if stop:
             raise Stopped(f"stopped after step {run.step} of {total}; resume goes on from there")
     given.facts["step"] = stepper.describe()
+
+
+def _check(optimizer: AdversarialOptimizer, losses: Mapping[str, float], run: _Run, total: int) -> None:
+    """Raises where something is not finite, so that no checkpoint holds it (waits for the device)."""
+    if optimizer.finite() and all(map(math.isfinite, losses.values())):
+        return
+    if run.halved:
+        raise Diverged(
+            f"the losses or the texture were no longer finite at step {run.step} of {total}, also with half the"
+            " learning rates; choose another preset or method"
+        )
+    raise _FirstDivergence(run.step)
 
 
 def starting_texture(given: MethodInput) -> Tensor:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from advtex_engine.checkpoint import Checkpoints, restore_generator
-from advtex_engine.errors import Stopped
+from advtex_engine.errors import Diverged, Stopped
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.methods.mean import dense_texture
 from advtex_engine.streaming import PairViews
@@ -64,6 +65,8 @@ def descend(
         done = step + 1
         if done % every == 0 or done == steps:
             losses.append({"step": done, name: float(total) / (done - (losses[-1]["step"] if losses else 0))})
+            if not math.isfinite(losses[-1][name]):
+                raise Diverged(f"the loss was no longer finite at step {done} of {steps}; choose another method")
             given.monitor.progress(done, steps, {name: losses[-1][name]})
             total.zero_()
         if done == steps or given.live.due():

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from advtex_engine.cameras import scaled_camera
 from advtex_engine.depth import depth_in_color_image
-from advtex_engine.errors import Problem, ScanError
+from advtex_engine.errors import Problem, ScanError, few_of
 from advtex_engine.monitor import Monitor
 from advtex_engine.previews import evenly_spread
 from advtex_engine.rasterize import rasterize
@@ -237,8 +237,8 @@ def _seeing(frames: Sequence[StoredFrame], mesh: Mesh, monitor: Monitor) -> tupl
         else:
             blind.append(frame.name)
     if blind:
-        named = ", ".join(blind[:3]) + (f" and {len(blind) - 3} more" if len(blind) > 3 else "")
-        monitor.warning(Problem("frame_sees_nothing", named, "does not see the mesh and is left out", "check the pose"))
+        told = "does not see the mesh and is left out"
+        monitor.warning(Problem("frame_sees_nothing", few_of(blind), told, "check the pose"))
     return tuple(kept)
 
 

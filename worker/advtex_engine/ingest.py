@@ -33,7 +33,7 @@ from advtex_engine.decode import (
     shrink_mask,
 )
 from advtex_engine.depth import DepthEncoding, Raw, declared_encoding, measure_depth, outside_mask
-from advtex_engine.errors import Problem, ScanError, Stopped
+from advtex_engine.errors import Problem, ScanError, Stopped, few_of
 from advtex_engine.frame_cameras import depth_camera, frame_camera, inverse_pose
 from advtex_engine.fusion import fuse
 from advtex_engine.meshio import load_mesh
@@ -143,8 +143,8 @@ def _capture(
         mesh=mesh,
         mesh_path="depth" if entry is None else entry.path,
         mesh_refinement="none" if entry is None else entry.refinement,
-        training=tuple(frame for frame, out in zip(frames, held, strict=True) if not out),
-        heldout=tuple(frame for frame, out in zip(frames, held, strict=True) if out),
+        training=tuple(frame for frame, out in zip(frames, held, strict=True) if frame and not out),
+        heldout=tuple(frame for frame, out in zip(frames, held, strict=True) if frame and out),
         kind=manifest.kind,
         up_axis=manifest.up_axis,
         manifest=manifest,
@@ -189,20 +189,33 @@ class _FrameData:
     mask: bytes | None = None
 
 
-def _decode_all(archive: ScanArchive, job: _Decoding, store: FrameStore, monitor: Monitor) -> list[StoredFrame]:
-    """All frames, in order; ScanError with one problem per broken file."""
-    frames, problems = list[StoredFrame](), list[Problem]()
+def _decode_all(archive: ScanArchive, job: _Decoding, store: FrameStore, monitor: Monitor) -> list[StoredFrame | None]:
+    """All frames, in order, None for one whose mask leaves nothing of it, which the monitor is told.
+
+    ScanError with one problem per broken file, or where nothing is left of any frame.
+    """
+    frames, problems, hidden = list[StoredFrame | None](), list[Problem](), list[str]()
     videos: dict[str, VideoReader] = {}
     files = (_read(archive, entry, videos, job.encoding is not None) for entry in job.manifest.frames)
     for outcome in in_threads(partial(_frame, job=job), files):
         if monitor.stop_requested():
             raise Stopped("stopped while frames are decoded; resume begins with the first one")
-        if isinstance(outcome, Frame):
-            frames.append(store.put(outcome))
-        else:
+        if not isinstance(outcome, Frame):
             problems += outcome
+        elif outcome.mask is not None and not bool(outcome.mask.any()):
+            frames.append(None)
+            hidden.append(outcome.name)
+        else:
+            frames.append(store.put(outcome))
     if problems:
         raise ScanError(*problems)
+    if hidden:
+        share = "all" if len(hidden) == len(frames) else f"{len(hidden)} of {len(frames)}"
+        remedy = "masks are 255 where the image may be used and 0 elsewhere: invert them, or leave them out"
+        problem = Problem("masked_out", few_of(hidden), f"masks leave no pixel of {share} frames", remedy)
+        if share == "all":
+            raise ScanError(problem)
+        monitor.warning(problem)
     return frames
 
 

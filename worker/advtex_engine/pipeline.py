@@ -26,7 +26,7 @@ from advtex_engine.config import PRESETS, Preset, PyramidLevel, TextureConfig
 from advtex_engine.curves import curves
 from advtex_engine.deep_check import judge
 from advtex_engine.devices import choose_device as choose_device
-from advtex_engine.errors import Diverged, MemoryShortage, OptionError
+from advtex_engine.errors import Diverged, MemoryShortage, OptionError, Problem, ScanError, few_of
 from advtex_engine.export import export_model
 from advtex_engine.fusion import fuse
 from advtex_engine.gallery import write_gallery
@@ -60,7 +60,7 @@ from advtex_engine.speckle import speckle_share
 from advtex_engine.streaming import host_allocator, keep_off
 from advtex_engine.texture import fill_holes
 from advtex_engine.toning import tone_views
-from advtex_engine.views import ViewMaps, build_view_maps
+from advtex_engine.views import ViewMaps, build_view_maps, foregrounds
 
 BORDERS = 1.25  # texels that views touch, of those that the charts cover
 OF_MESH, OF_ATLAS = ("t_pos_idx", "v_uv", "t_uv_idx"), ("width", "height", "source", "charts", "pages")
@@ -340,8 +340,23 @@ def _view_maps(
                 small, tuple(shrink(view, scale) for view in scene.views), scene.kind, allocate
             )
             folder.save(f"view_maps_{scale}", vars(maps[scale]))
+        _check_foregrounds(scene, maps[1], stages.monitor)
     stages.save()
     return maps
+
+
+def _check_foregrounds(scene: Scene, maps: ViewMaps, monitor: Monitor) -> None:
+    """Tells the monitor of views that show nothing, which no method draws from; ScanError where all are like that."""
+    shows = foregrounds(maps).tolist()
+    blind = [view.name for view, seen in zip(scene.views, shows, strict=True) if not seen]
+    if not blind:
+        return
+    share = "all" if len(blind) == len(shows) else f"{len(blind)} of {len(shows)}"
+    told = f"{share} frames show nothing of the mesh where they may be used"
+    problem = Problem("no_foreground", few_of(blind), told, "check the masks, the poses and the mesh")
+    if share == "all":
+        raise ScanError(problem)
+    monitor.warning(problem)
 
 
 def _selected_start(given: MethodInput) -> Tensor:

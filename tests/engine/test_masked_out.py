@@ -18,6 +18,9 @@ from advtex_engine.pipeline import texture_scan
 from advtex_engine.synthesize import synthesize
 
 VIEWS, WIDTH, HEIGHT = 8, 96, 72
+Part = tuple[slice, slice]
+NOTHING, CORNER = (slice(0, 0), slice(0, 0)), (slice(0, 2), slice(0, 4))
+"""Rows and columns."""
 CONFIG = TextureConfig(
     preset="preview", steps=6, face_budget=800, max_texture_size=256, holdout=4, refine=False, device="cpu"
 )
@@ -35,19 +38,19 @@ class Warned(Monitor):
 
 
 @pytest.fixture
-def masked(tmp_path: Path) -> Callable[[dict[int, slice]], Path]:
-    """Makes a scan without depth whose frames may only be used in the rows that are given for their numbers."""
+def masked(tmp_path: Path) -> Callable[[dict[int, Part]], Path]:
+    """Makes a scan without depth whose frames may only be used in the part that is given for their numbers."""
 
-    def make(rows: dict[int, slice]) -> Path:
+    def make(parts: dict[int, Part]) -> Path:
         scan = tmp_path / "scan"
         synthesize(scan, views=VIEWS, width=WIDTH, height=HEIGHT, seed=0)
         manifest = json.loads((scan / "scan.json").read_text())
         for number, frame in enumerate(manifest["frames"]):
             del frame["depth"]
-            if number in rows:
+            if number in parts:
                 frame["mask"] = f"mask-{number}.png"
                 mask = np.zeros((HEIGHT, WIDTH), np.uint8)
-                mask[rows[number]] = 255
+                mask[parts[number]] = 255
                 cv2.imwrite(str(scan / frame["mask"]), mask)
         (scan / "scan.json").write_text(json.dumps(manifest))
         return scan
@@ -55,10 +58,7 @@ def masked(tmp_path: Path) -> Callable[[dict[int, slice]], Path]:
     return make
 
 
-NOTHING, TOP = slice(0, 0), slice(0, 2)
-
-
-def test_masks_that_hide_all_of_every_frame_are_the_scans_fault(masked: Callable[[dict[int, slice]], Path]) -> None:
+def test_masks_that_hide_all_of_every_frame_are_the_scans_fault(masked: Callable[[dict[int, Part]], Path]) -> None:
     scan = masked(dict.fromkeys(range(VIEWS), NOTHING))
     with pytest.raises(ScanError, match="masks leave no pixel of all frames") as raised:
         ingest(scan, CONFIG, Monitor())
@@ -67,9 +67,9 @@ def test_masks_that_hide_all_of_every_frame_are_the_scans_fault(masked: Callable
 
 
 def test_frames_that_masks_hide_are_left_out_and_the_others_stay_what_they_are(
-    masked: Callable[[dict[int, slice]], Path],
+    masked: Callable[[dict[int, Part]], Path],
 ) -> None:
-    scan = masked({1: NOTHING, 2: NOTHING, 3: slice(10, 60)})
+    scan = masked({1: NOTHING, 2: NOTHING, 3: (slice(10, 60), slice(None))})
     plain, warned = Warned(), Warned()
     scene = ingest(scan, CONFIG, warned)
     manifest = json.loads((scan / "scan.json").read_text())
@@ -88,10 +88,10 @@ def test_frames_that_masks_hide_are_left_out_and_the_others_stay_what_they_are(
 
 
 def test_frames_that_show_the_mesh_nowhere_are_counted(
-    masked: Callable[[dict[int, slice]], Path], tmp_path: Path
+    masked: Callable[[dict[int, Part]], Path], tmp_path: Path
 ) -> None:
-    """The object is in the middle of the images: their first rows show the background."""
-    scan = masked({1: TOP, 4: TOP})
+    """The object is in the middle of the images: their corners show the background."""
+    scan = masked({1: CORNER, 4: CORNER})
     warned = Warned()
     result = texture_scan(scan, tmp_path / "out", CONFIG, work=tmp_path / "work", monitor=warned)
     (told,) = warned.told("no_foreground")
@@ -101,11 +101,11 @@ def test_frames_that_show_the_mesh_nowhere_are_counted(
 
 @pytest.mark.parametrize("method", ["adversarial", "l1"])
 def test_masks_that_leave_the_background_alone_are_the_scans_fault(
-    masked: Callable[[dict[int, slice]], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
+    masked: Callable[[dict[int, Part]], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
 ) -> None:
     """Where the check of conventions finds nothing amiss with the background."""
     monkeypatch.setattr("advtex_engine.pipeline.judge", lambda *_: None)
-    scan = masked(dict.fromkeys(range(VIEWS), TOP))
+    scan = masked(dict.fromkeys(range(VIEWS), CORNER))
     config = TextureConfig(preset="preview", method=method, steps=6, face_budget=800, device="cpu", refine=False)
     with pytest.raises(ScanError, match="all frames show nothing of the mesh"):
         texture_scan(scan, tmp_path / "out", config, work=tmp_path / "work")

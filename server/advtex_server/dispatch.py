@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 
 import structlog
 from redis import RedisError
@@ -22,6 +23,7 @@ from advtex_store.models import JobRow
 from advtex_store.queue import WorkerClass
 from advtex_store.retention import Retention
 from advtex_store.store import Store
+from advtex_store.troubles import ADOPT
 
 SPOOL_SECONDS = 86400.0  # leftovers of killed uploads are removed after this long
 ADOPT_ROWS = 100  # waiting rows that are looked at for a finished result, each time
@@ -145,19 +147,20 @@ class Dispatcher:
         self.store.records.explain(TOO_LARGE.format(gib=largest.gib), above=largest.memory_bytes)
 
     def reconcile(self) -> None:
-        """Give up expired leases, adopt results that nobody told the rows about, let go what has expired."""
+        """Give up expired leases, adopt results that nobody told the rows about, let go what has expired.
+
+        What fails for one job or upload stops no other (`Troubles`).
+        """
+        troubles = self.store.troubles
         for job_id, attempt in self.store.records.expired():
-            if self.store.results.adopt(job_id):
-                log.info("adopted a finished result", job=job_id)
-                continue
-            try:
-                state = self.store.records.lost(job_id, attempt, expired_only=True)
-            except StaleAttempt:
-                continue
-            log.warning("lease expired", job=job_id, attempt=attempt, state=state)
+            with troubles.of(ADOPT, job_id):
+                self._give_up(job_id, attempt)
+        aside = troubles.aside(ADOPT)
         for row in self.store.records.waiting(ADOPT_ROWS):
-            if row.attempt > 1 and self.store.results.adopt(row.id):
-                log.info("adopted a finished result", job=row.id)
+            if row.attempt > 1 and row.id not in aside:
+                with troubles.of(ADOPT, row.id):
+                    if self.store.results.adopt(row.id):
+                        log.info("adopted a finished result", job=row.id)
         self.retention.expire()
         self.retention.purge()
         self.retention.tidy()
@@ -168,3 +171,11 @@ class Dispatcher:
             if orphans := self.retention.sweep():
                 log.info("orphans removed", count=orphans)
         self.store.blobs.clear_spool(time.time() - SPOOL_SECONDS)
+
+    def _give_up(self, job_id: str, attempt: int) -> None:
+        if self.store.results.adopt(job_id):
+            log.info("adopted a finished result", job=job_id)
+            return
+        with suppress(StaleAttempt):
+            state = self.store.records.lost(job_id, attempt, expired_only=True)
+            log.warning("lease expired", job=job_id, attempt=attempt, state=state)

@@ -11,6 +11,9 @@ from sqlalchemy.exc import SQLAlchemyError
 from advtex_server.settings import ServerSettings
 from advtex_store.errors import StoreError
 from advtex_store.store import Store
+from advtex_store.troubles import ROUNDS
+
+NAMED_TROUBLES = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,8 +27,8 @@ class Check:
 
 
 def checks(store: Store, settings: ServerSettings) -> list[Check]:
-    """Look at database, blobs, disk, queue and workers."""
-    return [_database(store), _blobs(store), _disk(store, settings), _redis(store), _workers(store)]
+    """Look at database, blobs, disk, queue, workers and what housekeeping could not do."""
+    return [_database(store), _blobs(store), _disk(store, settings), _redis(store), _workers(store), _troubles(store)]
 
 
 def _database(store: Store) -> Check:
@@ -78,6 +81,21 @@ def _workers(store: Store) -> Check:
     if pauses:
         return Check("workers", False, False, f"{len(living)} running; {'; '.join(pauses)}")
     return Check("workers", True, False, f"{len(living)} running")
+
+
+def _troubles(store: Store) -> Check:
+    try:
+        found = store.troubles.all()
+    except SQLAlchemyError:
+        return Check("housekeeping", False, False, "not known while the database does not answer")
+    told = [f"{row.task} {row.item} {_rounds(row.rounds)}: {row.error}" for row in found[:NAMED_TROUBLES]]
+    if len(found) > NAMED_TROUBLES:
+        told.append(f"and {len(found) - NAMED_TROUBLES} more")
+    return Check("housekeeping", not told, False, "; ".join(told))
+
+
+def _rounds(rounds: int) -> str:
+    return f"failed {rounds} times" + (" and is set aside for a day" if rounds >= ROUNDS else "")
 
 
 def _first_line(error: Exception) -> str:

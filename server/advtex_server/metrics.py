@@ -59,6 +59,12 @@ class FleetCollector(Collector):
         yield GaugeMetricFamily("advtex_queue_age_seconds", "Age of the oldest job that waits", load.oldest_seconds)
         yield GaugeMetricFamily("advtex_steps_per_second", "Of all running jobs together", load.steps_per_second)
         yield GaugeMetricFamily("advtex_webhook_deliveries", "Deliveries that wait", load.deliveries)
+        troubles = GaugeMetricFamily(
+            "advtex_housekeeping_troubles", "Jobs and uploads that housekeeping fails for", labels=["task", "set_aside"]
+        )
+        for (task, aside), count in self.store.troubles.counts().items():
+            troubles.add_metric([task, "yes" if aside else "no"], count)
+        yield troubles
         yield GaugeMetricFamily("advtex_disk_free_bytes", "Room for uploads", self.store.blobs.free_bytes())
         workers = GaugeMetricFamily("advtex_workers", "Living workers by memory for jobs", labels=["gib"])
         try:

@@ -169,6 +169,19 @@ class TallyRow(Base):
     total: Mapped[float]
 
 
+class TroubleRow(Base):
+    """A job or upload (`item`) that a task of housekeeping fails for, and for how many rounds in a row."""
+
+    __tablename__ = "troubles"
+
+    task: Mapped[str] = mapped_column(primary_key=True)
+    item: Mapped[str] = mapped_column(primary_key=True)
+    rounds: Mapped[int]
+    error: Mapped[str] = mapped_column(Text)
+    first_at: Mapped[float]
+    last_at: Mapped[float]
+
+
 class WebhookRow(Base):
     """Where an owner wants to be told. `failures` counts tries in a row that failed; too many disable it."""
 

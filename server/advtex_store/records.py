@@ -44,6 +44,7 @@ from advtex_store.database import Database
 from advtex_store.errors import IllegalTransition, RecordNotFound, StaleAttempt
 from advtex_store.models import EventRow, JobRow
 from advtex_store.tallies import ATTEMPTS, tally, tally_end
+from advtex_store.troubles import ADOPT, not_aside
 from advtex_store.webhooks import tell_webhooks
 
 S = JobState
@@ -263,10 +264,11 @@ class Records:
             session.execute(update(JobRow).where(*where).values(**values))
 
     def expired(self, limit: int = 100) -> list[tuple[str, int]]:
-        """(job, attempt) whose lease has run out."""
+        """(job, attempt) whose lease has run out, of jobs that were not set aside."""
         with self.database.read() as session:
             now = self.database.now(session)
             query = select(JobRow.id, JobRow.attempt).where(JobRow.state == S.running, JobRow.lease_expires_at < now)
+            query = query.where(not_aside(ADOPT, JobRow.id, now))
             return [(job_id, attempt) for job_id, attempt in session.execute(query.limit(limit))]
 
     def count_by_state(self) -> dict[str, int]:

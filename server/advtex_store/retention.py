@@ -10,17 +10,19 @@ from advtex_store.blobs import Blobs
 from advtex_store.database import Database
 from advtex_store.ids import ID
 from advtex_store.models import JobRow, UploadRow
+from advtex_store.troubles import PURGE, SWEEP, TIDY, Troubles, not_aside
 
 BATCH = 100
 SETTLED_SECONDS = 600.0  # after a job's end; attempts that lost it have noticed by then
 
 
 class Retention:
-    """Every step can be repeated, and can be done by several servers at once."""
+    """Every step can be repeated, and by several servers at once; what fails for one item stops no other."""
 
     def __init__(self, database: Database, blobs: Blobs) -> None:
         self.database = database
         self.blobs = blobs
+        self.troubles = Troubles(database, blobs)
 
     def expire(self) -> None:
         """Hide ended jobs, and uploads without a job, that are past the time that was announced for them."""
@@ -48,38 +50,45 @@ class Retention:
             )
 
     def purge(self) -> int:
-        """Remove the blobs of hidden rows. -> how many rows were done."""
+        """Remove the blobs of hidden rows, as far as they can be removed. -> how many rows were looked at."""
         with self.database.read() as session:
-            jobs = session.scalars(select(JobRow.id).where(_hidden(JobRow)).limit(BATCH)).all()
-            uploads = session.scalars(select(UploadRow.id).where(_hidden(UploadRow)).limit(BATCH)).all()
+            now = self.database.now(session)
+            jobs = session.scalars(select(JobRow.id).where(_hidden(JobRow, now)).limit(BATCH)).all()
+            uploads = session.scalars(select(UploadRow.id).where(_hidden(UploadRow, now)).limit(BATCH)).all()
         for job_id in jobs:
-            self.blobs.delete_prefix(keys.job_prefix(job_id))
-            self._done(JobRow, job_id)
+            with self.troubles.of(PURGE, job_id):
+                self.blobs.delete_prefix(keys.job_prefix(job_id))
+                self._done(JobRow, job_id)
         for upload_id in uploads:
-            self.blobs.drop_partial(keys.scan_key(upload_id))
-            self.blobs.delete_prefix(keys.scan_prefix(upload_id))
-            self._done(UploadRow, upload_id)
+            with self.troubles.of(PURGE, upload_id):
+                self.blobs.drop_partial(keys.scan_key(upload_id))
+                self.blobs.delete_prefix(keys.scan_prefix(upload_id))
+                self._done(UploadRow, upload_id)
         return len(jobs) + len(uploads)
 
     def tidy(self) -> int:
-        """Remove what attempts of succeeded jobs left that is no part of the result. -> how many jobs were done.
+        """Remove what attempts of succeeded jobs left that is no part of the result. -> how many jobs were looked at.
 
         A result never changes, so nothing that a later attempt may write here is wanted either.
         """
         with self.database.read() as session:
-            limit = self.database.now(session) - SETTLED_SECONDS
+            now = self.database.now(session)
             query = select(JobRow).where(JobRow.state == JobState.succeeded, JobRow.tidied_at.is_(None))
-            query = query.where(JobRow.finished_at < limit, JobRow.deleted_at.is_(None))
-            rows = session.scalars(query.limit(BATCH)).all()
+            query = query.where(JobRow.finished_at < now - SETTLED_SECONDS, JobRow.deleted_at.is_(None))
+            rows = session.scalars(query.where(not_aside(TIDY, JobRow.id, now)).limit(BATCH)).all()
         for row in rows:
-            kept = {entry["key"] for entry in row.results}
-            for prefix in (keys.checkpoints_prefix(row.id), keys.live_prefix(row.id), keys.results_prefix(row.id)):
-                for info in list(self.blobs.list(prefix)):
-                    if info.key not in kept:
-                        self.blobs.delete(info.key)
-            with self.database.write() as session:
-                session.execute(update(JobRow).where(JobRow.id == row.id).values(tidied_at=self.database.now(session)))
+            with self.troubles.of(TIDY, row.id):
+                self._tidy(row)
         return len(rows)
+
+    def _tidy(self, row: JobRow) -> None:
+        kept = {entry["key"] for entry in row.results}
+        for prefix in (keys.checkpoints_prefix(row.id), keys.live_prefix(row.id), keys.results_prefix(row.id)):
+            for info in list(self.blobs.list(prefix)):
+                if info.key not in kept:
+                    self.blobs.delete(info.key)
+        with self.database.write() as session:
+            session.execute(update(JobRow).where(JobRow.id == row.id).values(tidied_at=self.database.now(session)))
 
     def sweep(self) -> int:
         """Remove the blobs of uploads and jobs that have no row, or one that is purged. -> how many there were.
@@ -97,10 +106,11 @@ class Retention:
                 with self.database.read() as session:
                     alive = set(session.scalars(select(table.id).where(table.id.in_(ids), table.purged_at.is_(None))))
                 for orphan in (found_id for found_id in ids if found_id not in alive):
-                    if table is UploadRow:
-                        self.blobs.drop_partial(keys.scan_key(orphan))
-                    self.blobs.delete_prefix(f"{prefix}{orphan}/")
-                    swept += 1
+                    with self.troubles.of(SWEEP, orphan):
+                        if table is UploadRow:
+                            self.blobs.drop_partial(keys.scan_key(orphan))
+                        self.blobs.delete_prefix(f"{prefix}{orphan}/")
+                        swept += 1
         return swept + self._sweep_multiparts(keys.SCANS, UploadRow) + self._sweep_multiparts(keys.JOBS, JobRow)
 
     def _sweep_multiparts(self, prefix: str, table: type[JobRow] | type[UploadRow]) -> int:
@@ -114,8 +124,9 @@ class Retention:
         for found in list(self.blobs.unpublished(prefix)):
             row_id = found.key.removeprefix(prefix).partition("/")[0]
             if ID.fullmatch(row_id) and (found.superseded or not self._needs_bytes(table, row_id)):
-                self.blobs.abort(found)
-                swept += 1
+                with self.troubles.of(SWEEP, row_id):
+                    self.blobs.abort(found)
+                    swept += 1
         return swept
 
     def _needs_bytes(self, table: type[JobRow] | type[UploadRow], row_id: str) -> bool:
@@ -133,5 +144,5 @@ class Retention:
             session.execute(update(table).where(table.id == row_id).values(purged_at=self.database.now(session)))
 
 
-def _hidden(table: type[JobRow] | type[UploadRow]) -> ColumnElement[bool]:
-    return and_(table.deleted_at.is_not(None), table.purged_at.is_(None))
+def _hidden(table: type[JobRow] | type[UploadRow], now: float) -> ColumnElement[bool]:
+    return and_(table.deleted_at.is_not(None), table.purged_at.is_(None), not_aside(PURGE, table.id, now))

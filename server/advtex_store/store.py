@@ -18,6 +18,7 @@ from advtex_store.sessions import Sessions
 from advtex_store.settings import StoreSettings
 from advtex_store.submissions import Submissions
 from advtex_store.tallies import Tallies
+from advtex_store.troubles import Troubles
 from advtex_store.uploads import Uploads
 from advtex_store.webhooks import Webhooks
 
@@ -41,6 +42,7 @@ class Store:
     live: Live
     webhooks: Webhooks
     tallies: Tallies
+    troubles: Troubles
     queue: JobQueue
 
     def close(self) -> None:
@@ -71,5 +73,6 @@ def open_store(settings: StoreSettings) -> Store:
         live=Live(blobs),
         webhooks=Webhooks(database),
         tallies=Tallies(database),
+        troubles=Troubles(database, blobs),
         queue=JobQueue(connect_redis(settings)),
     )

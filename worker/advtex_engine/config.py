@@ -31,7 +31,6 @@ class Preset:
     lr_texture        1e-3, Adam; colors in [0, 1]. Adam's step is as long however rarely a view shows the texel and
                       however faint its gradient is: it is noise that accumulates while nothing holds it back
     lr_discriminator  1e-4, Adam
-    lr_follows        power of lambda's decay by which the texture's rate falls (paper: 0, not at all)
     lr_end            share of both at the last step, reached in a straight line (paper: 1, no decay)
     beta1             0.5
     l1_weight         lambda = 10 at the start
@@ -58,7 +57,6 @@ class Preset:
     pretraining: int = 0
     lr_texture: float = 1e-3
     lr_discriminator: float = 1e-4
-    lr_follows: float = 0.0
     lr_end: float = 1.0
     beta1: float = 0.5
     l1_weight: float = 10.0
@@ -97,10 +95,10 @@ PAPER = replace(
     toned=True,
     # In the paper's case of two dimensions every step shows every texel. Here a view shows a tenth of them: Adam's
     # moments, means over all steps, make a step about 1 / sqrt(.1) times the rate for each time that the texel is seen.
-    lr_texture=2e-4,
-    # While lambda is high, the L1 term undoes what noise does to a texel. Later nothing does, and the texture drifts
-    # from the photographs to all that the discriminator has not learned to tell from them.
-    lr_follows=0.5,
+    # Noise adds up with the rate times the root of the number of steps, what the losses agree on with the rate times
+    # that number.
+    lr_texture=4e-5,
+    lr_end=0.0,
     # The warped auxiliary image is displaced by the errors of two cameras, the source by those of one.
     l1_target="source",
     # A texture that cannot be told from the real examples is as far from the photographs as they are: on two kitchens

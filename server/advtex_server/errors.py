@@ -21,6 +21,7 @@ from advtex_store import errors as store
 STORE_CODES: Mapping[type[store.StoreError], ErrorCode] = {
     store.RecordNotFound: ErrorCode.not_found,
     store.ReferenceRefused: ErrorCode.invalid_source,
+    store.ReferenceUnreadable: ErrorCode.invalid_source,
     store.BlobNotFound: ErrorCode.not_found,
     store.IllegalTransition: ErrorCode.conflict,
     store.StaleAttempt: ErrorCode.conflict,
@@ -29,6 +30,7 @@ STORE_CODES: Mapping[type[store.StoreError], ErrorCode] = {
     store.IdempotencyInFlight: ErrorCode.idempotency_in_flight,
     store.NoSpace: ErrorCode.insufficient_storage,
     store.BlobsUnavailable: ErrorCode.unavailable,
+    store.BlobsRefused: ErrorCode.unavailable,
     store.QuotaExceeded: ErrorCode.quota_exceeded,
 }
 HTTP_CODES: Mapping[int, ErrorCode] = {

@@ -9,8 +9,10 @@ StoreError
 ├── IdempotencyInFlight   the same key is being worked on right now
 ├── QuotaExceeded         the owner has as much as the key allows
 ├── ReferenceRefused      a scan's URL is malformed, or lies where nothing may be read
+│   └── ReferenceUnreadable   it lies where it may, and this service's user or keys have no right to read it
 ├── BlobNotFound
 ├── BlobsUnavailable      the storage cannot be reached now
+│   └── BlobsRefused          it answers and refuses: there is no such bucket, or the keys do not open it
 └── NoSpace               the disk is full; nothing was kept
 """
 
@@ -53,6 +55,10 @@ class ReferenceRefused(StoreError):
     """A scan's URL is malformed, or lies where nothing may be read."""
 
 
+class ReferenceUnreadable(ReferenceRefused):
+    """The service has no right to read the scan."""
+
+
 class BlobNotFound(StoreError):
     """No blob has this key."""
 
@@ -63,3 +69,7 @@ class NoSpace(StoreError):
 
 class BlobsUnavailable(StoreError):
     """The blob storage cannot be reached at the moment."""
+
+
+class BlobsRefused(BlobsUnavailable):
+    """The storage answers, and refuses: no retry helps before somebody mends its settings."""

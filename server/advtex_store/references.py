@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
 
 from advtex_scan import ArchiveLimits, unsafe_reason
-from advtex_store.errors import BlobNotFound, ReferenceRefused
+from advtex_store.errors import BlobNotFound, BlobsRefused, ReferenceRefused, ReferenceUnreadable
 from advtex_store.files import translated
 
 if TYPE_CHECKING:
@@ -51,15 +51,17 @@ class References:
     def fetch(self, url: str, folder: Path, check: Callable[[], None] = lambda: None) -> Path:
         """The scan on this machine: in place for `file://`, else copied below `folder`, with the objects' times.
 
-        ReferenceRefused for what is not allowed or no URL; BlobNotFound if there is nothing. check: called between
-        pieces, may raise to end it.
+        ReferenceRefused for what is not allowed or no URL, ReferenceUnreadable for what this service has no right to
+        read; BlobNotFound if there is nothing. check: called between pieces, may raise to end it.
         """
         place = self._allowed(url)
         if place.scheme == "file":
-            if not place.path.exists():
-                raise BlobNotFound(f"there is nothing at {url}")
+            _check_readable(place.path, url)
             return place.path
-        return _copy(place, url, folder, check)
+        try:
+            return _copy(place, url, folder, check)
+        except BlobsRefused as error:
+            raise ReferenceUnreadable(f"{url} cannot be read by the service: {error}") from error
 
     def _allowed(self, url: str) -> _Place:
         place = _parse(url)
@@ -100,6 +102,20 @@ def _resolved(place: _Place) -> _Place:
     except (OSError, RuntimeError):  # a loop of links
         raise ReferenceRefused(f"{place.path.as_uri()} cannot be resolved") from None
     return _Place("file", "", path.parts[1:])
+
+
+def _check_readable(path: Path, url: str) -> None:
+    """Of a folder, that it can be listed and entered; of a file, that it can be opened."""
+    try:
+        if path.is_dir():
+            next(path.iterdir(), path).stat()
+        else:
+            path.open("rb").close()
+    except (FileNotFoundError, NotADirectoryError):
+        raise BlobNotFound(f"there is nothing at {url}") from None
+    except PermissionError as error:
+        remedy = "let its user read it and enter the folders above it"
+        raise ReferenceUnreadable(f"{url} cannot be read by the service ({error.strerror}): {remedy}") from None
 
 
 def _copy(place: _Place, url: str, folder: Path, check: Callable[[], None]) -> Path:

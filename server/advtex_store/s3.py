@@ -8,11 +8,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 import obstore
-from obstore.exceptions import AlreadyExistsError, BaseError, NotFoundError, PreconditionError
+from obstore.exceptions import (
+    AlreadyExistsError,
+    BaseError,
+    NotFoundError,
+    PermissionDeniedError,
+    PreconditionError,
+    UnauthenticatedError,
+)
 from obstore.store import S3Store
 
 from advtex_store.blobs import BlobInfo, Blobs, check_key, check_prefix
-from advtex_store.errors import BlobNotFound, BlobsUnavailable
+from advtex_store.errors import BlobNotFound, BlobsRefused, BlobsUnavailable
 from advtex_store.partials import Partial, PublishedPartial, Unpublished
 from advtex_store.s3_partial import MULTIPART_SUFFIX, S3Multipart, S3Partial
 
@@ -113,7 +120,7 @@ class S3Blobs(Blobs):
             with _translated(self.bucket):
                 yield
         except BlobNotFound:
-            raise BlobsUnavailable(f"there is no bucket {self.bucket!r}, or the keys do not open it") from None
+            raise BlobsRefused(f"there is no bucket {self.bucket!r}, or the keys do not open it") from None
 
 
 class FoundObject(NamedTuple):
@@ -171,5 +178,7 @@ def _translated(key: str) -> Iterator[None]:
         raise BlobNotFound(key) from None
     except (AlreadyExistsError, PreconditionError):
         raise
+    except (PermissionDeniedError, UnauthenticatedError) as error:
+        raise BlobsRefused(f"the object storage refuses access to {key}: {error}") from error
     except BaseError as error:
         raise BlobsUnavailable(f"the object storage does not answer: {error}") from error

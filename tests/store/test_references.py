@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import obstore
@@ -11,8 +14,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from obstore.store import S3Store
 
-from advtex_store.errors import BlobNotFound, ReferenceRefused
+from advtex_server.errors import translated
+from advtex_store.errors import BlobNotFound, ReferenceRefused, ReferenceUnreadable
 from advtex_store.references import References
+
+NOBODY = 65534
 
 
 @pytest.fixture
@@ -39,6 +45,44 @@ def test_what_lies_below_a_root_is_used_in_place(tree: Path, references: Referen
     assert not (tmp_path / "copy").exists()
     with pytest.raises(BlobNotFound, match="nothing at"):
         references.fetch((scans / "none").as_uri(), tmp_path)
+
+
+@contextmanager
+def as_nobody() -> Iterator[None]:
+    """Rights mean nothing to root."""
+    if os.geteuid() != 0:
+        yield
+        return
+    os.setegid(NOBODY)
+    os.seteuid(NOBODY)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
+        os.setegid(0)
+
+
+@pytest.mark.parametrize("locked", ["a", "b.zip", "."])
+def test_what_the_service_has_no_right_to_read_says_so(locked: str) -> None:
+    with tempfile.TemporaryDirectory() as folder:  # pytest's own is closed to others
+        root = Path(folder)
+        root.chmod(0o755)
+        (root / "scans" / "a").mkdir(parents=True)
+        (root / "scans" / "a" / "scan.json").write_text("{}")
+        (root / "scans" / "b.zip").write_bytes(b"zip")
+        references = References([(root / "scans").as_uri()])
+        (root / "scans" / locked).chmod(0)
+        url = (root / "scans" / ("a" if locked == "." else locked)).as_uri()
+        with (
+            as_nobody(),
+            pytest.raises(ReferenceUnreadable, match=r"cannot be read by the service \(Permission denied\)"),
+        ):
+            references.fetch(url, root / "copy")
+        (root / "scans" / locked).chmod(0o755)
+        with as_nobody():
+            assert references.fetch(url, root / "copy").exists()
+    told = translated(ReferenceUnreadable("no right"))
+    assert (told.status, told.body.code) == (422, "invalid_source")
 
 
 REFUSED = {

@@ -16,10 +16,11 @@ from live_service import wait_until
 
 from advtex_contract.jobs import JobState
 from advtex_store import keys
-from advtex_store.errors import BlobsUnavailable, NoSpace
+from advtex_store.errors import BlobsRefused, BlobsUnavailable, NoSpace, ReferenceUnreadable
 from advtex_store.models import JobRow
 from advtex_store.results import Results
 from advtex_store.store import Store
+from advtex_worker.attempt import Attempt
 from advtex_worker.settings import WorkerSettings
 from advtex_worker.tasks import Host, run_attempt
 
@@ -194,6 +195,65 @@ def test_a_storage_that_fails_for_a_while_delays_the_results(
     run_attempt(host("quick"), job_id, 1)
     row = store.records.job(job_id)
     assert (row.state, row.attempt) == (JobState.succeeded, 1)
+
+
+REFUSALS = [
+    PermissionError(13, "Permission denied", "/mnt/scans"),
+    FileNotFoundError(2, "No such file or directory", "/mnt/scans"),
+    BlobsRefused("there is no bucket 'scans', or the keys do not open it"),
+    ReferenceUnreadable("file:///mnt/scans cannot be read by the service (Permission denied): let its user read it"),
+]
+
+
+@pytest.mark.parametrize("refusal", REFUSALS, ids=lambda error: type(error).__name__)
+def test_a_refusal_that_stays_ends_the_job_with_its_reason_after_a_while(
+    store: Store, settings: WorkerSettings, new_job: NewJob, monkeypatch: pytest.MonkeyPatch, refusal: Exception
+) -> None:
+    monkeypatch.setattr("advtex_worker.attempt.RETRY_SECONDS", 0.5)
+
+    def refused(*_: Any) -> None:
+        raise refusal
+
+    monkeypatch.setattr("advtex_worker.attempt.Attempt._fetch_scan", refused)
+    job_id = new_job()
+    given = Host(settings.model_copy(update={"refused_seconds": 2.0}), engine="fake_engines:quick")
+    thread = in_background(given, job_id)
+    wait_until(lambda: "cannot use the storage" in store.records.job(job_id).waiting_reason)
+    row = store.records.job(job_id)
+    assert row.state == JobState.running
+    assert str(refusal)[:40] in row.waiting_reason
+    thread.join()
+    row = store.records.job(job_id)
+    assert (row.state, row.attempt) == (JobState.failed, 1)
+    assert row.error is not None
+    assert row.error["code"] == "storage_refused"
+    assert str(refusal) in row.error["message"]
+    assert list(settings.workspaces.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "trouble", [BlobsUnavailable("no answer " * 50), NoSpace("the disk is full"), PermissionError(13, "denied")]
+)
+def test_an_outage_and_a_refusal_that_is_mended_cost_nothing(
+    store: Store, settings: WorkerSettings, new_job: NewJob, monkeypatch: pytest.MonkeyPatch, trouble: Exception
+) -> None:
+    """Outages may last longer than refusals."""
+    monkeypatch.setattr("advtex_worker.attempt.RETRY_SECONDS", 0.5)
+    fetch, began = Attempt._fetch_scan, time.monotonic()
+
+    def troubled(self: Attempt) -> None:
+        if time.monotonic() - began < 2:
+            raise trouble
+        fetch(self)
+
+    monkeypatch.setattr(Attempt, "_fetch_scan", troubled)
+    job_id, patience = new_job(), 60.0 if isinstance(trouble, PermissionError) else 0.5
+    given = Host(settings.model_copy(update={"refused_seconds": patience}), engine="fake_engines:quick")
+    thread = in_background(given, job_id)
+    wait_until(lambda: store.records.job(job_id).waiting_reason != "")
+    thread.join()
+    row = store.records.job(job_id)
+    assert (row.state, row.attempt, row.waiting_reason) == (JobState.succeeded, 1, "")
 
 
 def test_a_flaw_of_the_worker_itself_is_a_death_with_its_traceback(

@@ -22,7 +22,15 @@ from sqlalchemy.exc import SQLAlchemyError
 from advtex_contract.errors import ErrorDetail
 from advtex_contract.jobs import JobError
 from advtex_store import keys
-from advtex_store.errors import BlobNotFound, NoSpace, ReferenceRefused, StaleAttempt, StoreError
+from advtex_store.errors import (
+    BlobNotFound,
+    BlobsRefused,
+    NoSpace,
+    ReferenceRefused,
+    ReferenceUnreadable,
+    StaleAttempt,
+    StoreError,
+)
 from advtex_store.files import translated
 from advtex_store.records import Claim
 from advtex_store.store import Store
@@ -49,6 +57,7 @@ from advtex_worker.settings import WorkerSettings
 RETRY_SECONDS = 5.0
 KILL_SECONDS = 1.0  # after a cancel: a runner whose interpreter is held by native code does not hear it
 POLL_SECONDS = 0.05
+REASON_LENGTH = 120
 RECORD_SECONDS = 1.2  # after a cancel: what is not in the storage by then stays out of it
 WORKSPACE = "attempt-"  # what the names of workspaces begin with; other folders beside them are nobody's business here
 
@@ -58,6 +67,10 @@ log = structlog.get_logger()
 
 class Interrupted(Exception):
     """The run has to end (`LeaseKeeper.ending` says why) while something waits for storage."""
+
+
+class Refused(Exception):
+    """The storage has refused what the attempt needs for too long."""
 
 
 @dataclass(frozen=True)
@@ -172,6 +185,9 @@ class Attempt:
                 self._run()
         except Interrupted:
             self._give_back()
+        except Refused as refused:
+            error = JobError(code="storage_refused", message=str(refused), log_tail=self._log_tail())
+            self._record(lambda: self._store.records.fail(self._job_id, self._number, error))
 
     def _run(self) -> None:
         try:
@@ -330,6 +346,12 @@ class Attempt:
     def _out_of_time(self) -> bool:
         return time.monotonic() - self._canceled_at >= RECORD_SECONDS
 
+    def _why_paused(self, error: Exception) -> str:
+        if _is_disk_full(error):
+            return self._no_room(f"{self._settings.workspaces} or the storage")
+        reason = str(error)[:REASON_LENGTH]  # the row's column is short
+        return f"its worker {socket.gethostname()[:64]} cannot use the storage ({reason}); it goes on when it can"
+
     def _no_room(self, place: str) -> str:
         return f"the disk of its worker {socket.gethostname()} is full ({place}); it goes on when there is room"
 
@@ -366,16 +388,23 @@ class Attempt:
         return future.result()
 
     def _persist(self, action: Callable[[], T]) -> T:
-        """Try until the storage plays along: a full disk or an unreachable bucket pauses the work and loses nothing."""
+        """Try until the storage plays along: a full disk or an unreachable bucket pauses the work and loses nothing.
+
+        Refused: it was no outage, but a refusal that did not change for `refused_seconds`.
+        """
+        refused_at = math.inf
         while True:
             try:
                 done = action()
-            except (StaleAttempt, BlobNotFound, ReferenceRefused):
-                raise
             except (OSError, StoreError, SQLAlchemyError) as error:
-                if _is_disk_full(error):
-                    self._keeper.paused = self._no_room(f"{self._settings.workspaces} or the storage")
+                if _is_answer(error):
+                    raise
+                self._keeper.paused = self._why_paused(error)
                 self._log.warning("storage is in trouble, trying again", error=f"{type(error).__name__}: {error}")
+                refused_at = min(refused_at, time.monotonic()) if _is_refusal(error) else math.inf
+                if time.monotonic() - refused_at >= self._settings.refused_seconds:
+                    host, minutes = socket.gethostname(), self._settings.refused_seconds / 60
+                    raise Refused(f"the worker {host} was refused for {minutes:.0f} min: {error}") from error
             else:
                 self._keeper.paused = ""
                 return done
@@ -383,6 +412,19 @@ class Attempt:
                 if self._keeper.ending:
                     raise Interrupted
                 time.sleep(0.5)
+
+
+def _is_answer(error: Exception) -> bool:
+    """Errors that say how things are: no other try would say otherwise."""
+    if isinstance(error, ReferenceUnreadable):  # may be mended while the job waits
+        return False
+    return isinstance(error, StaleAttempt | BlobNotFound | ReferenceRefused)
+
+
+def _is_refusal(error: Exception) -> bool:
+    """Errors that stay until somebody mends rights or settings, unlike an outage or a full disk."""
+    lasting = PermissionError | FileNotFoundError | NotADirectoryError | BlobsRefused | ReferenceUnreadable
+    return isinstance(error, lasting)
 
 
 def _is_disk_full(error: Exception) -> bool:

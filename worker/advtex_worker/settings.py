@@ -25,6 +25,9 @@ class WorkerSettings(StoreSettings):
     work_dir: Path | None = None
     threads: int = Field(default_factory=lambda: len(os.sched_getaffinity(0)), ge=1, description="of the engine")
     grace_seconds: float = Field(default=30.0, gt=0, description="a runner that was asked to stop is killed after this")
+    refused_seconds: float = Field(
+        default=600.0, ge=0, description="a job ends after the storage has refused it for so long: no right, no bucket"
+    )
     heartbeat_seconds: float = Field(default=0.5, gt=0, description="between renewals of the lease")
     log_level: str = Field(default="INFO", pattern=r"^(DEBUG|INFO|WARNING|ERROR)$")
 

@@ -20,6 +20,7 @@ from advtex_server.embedded import EmbeddedRedis, SetupError, client_key, only_o
 from advtex_server.settings import ServerSettings
 from advtex_store.accounts import Accounts, key_id
 from advtex_store.database import Database, upgrade_database
+from advtex_store.secrecy import hide_environment
 from advtex_store.sessions import Sessions
 
 WORKER_STOP_SECONDS = 60.0  # a worker writes its checkpoint in this time
@@ -42,6 +43,7 @@ def serve(settings: ServerSettings, host: str, port: int) -> None:
 
 def up(settings: ServerSettings, host: str, port: int) -> None:
     """Everything on this machine: Redis, database, one key, one worker, and the API. SetupError."""
+    hide_environment()  # from the worker's runners; where it cannot be hidden, the worker says so
     with only_one(settings.data_dir), _listen(host, port) as listener:
         children = []
         if "redis_url" not in settings.model_fields_set:

@@ -7,22 +7,16 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
 
+from advtex_store.secrecy import public_environment
 from advtex_worker.events import CANCEL_LINE, STOP_LINE, Event, Request, parse_event
 
 LOG_TAIL_BYTES = 6000
-KEPT_OUT = ("ADVTEX_", "AWS_")  # the runner reads hostile files: it gets no passwords
-PASSED_ON = ("ADVTEX_LPIPS_WEIGHTS", "ADVTEX_VGG_WEIGHTS")  # folders that the engine reads
-
-
-def child_environment(environment: Mapping[str, str]) -> dict[str, str]:
-    """What the runner may know of the worker's environment."""
-    return {name: value for name, value in environment.items() if name in PASSED_ON or not name.startswith(KEPT_OUT)}
 
 
 class Child:
@@ -37,7 +31,7 @@ class Child:
         self._log = log
         self._lock = threading.Lock()
         self.returncode = 0
-        environment = child_environment(os.environ)
+        environment = public_environment(os.environ)
         for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
             environment[name] = str(threads)
         if gpu is not None:

@@ -28,6 +28,7 @@ from rq.serializers import JSONSerializer
 
 from advtex_store.logs import configure_logs
 from advtex_store.queue import JobQueue, attempt_of, class_of, connect_redis, queue_name
+from advtex_store.secrecy import hide_environment
 from advtex_worker.parentage import die_with_parent
 from advtex_worker.settings import WorkerSettings
 from advtex_worker.slots import Slot, find_slots, hold, settings_of, supervise
@@ -171,6 +172,8 @@ def main() -> None:
     except ValidationError as error:
         sys.exit(f"advtex-worker: the configuration is wrong: {error}")
     configure_logs(logging.getLevelNamesMapping()[settings.log_level])
+    if (reason := hide_environment()) is not None:
+        log.warning("runners could read this process's environment, passwords included", reason=reason)
     log.info("worker begins", device=settings.device, threads=settings.threads)
     serve(Host(settings), [sys.executable, "-m", "advtex_worker.main"])
     log.info("worker ends")

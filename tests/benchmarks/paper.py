@@ -94,6 +94,7 @@ FROM_MEAN: dict[str, Any] = {
     "start": "mean",
     "toned": False,
     "lr_texture": 1e-3,
+    "lr_unit": "color",
     "l1_target": "auxiliary",
     "lr_end": 1.0,
     "nearest_share": 1.0,

@@ -9,6 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from advtex_engine.disagreement import disagreement
 from advtex_engine.texture import encode_uv
 from advtex_engine.toning import tone_views
 from advtex_engine.views import ViewMaps
@@ -89,3 +90,14 @@ def test_a_texture_of_another_size_tones_alike(toned: tuple[ViewMaps, ViewMaps])
     doubled = F.interpolate(texture().permute(2, 0, 1)[None], scale_factor=2.0, mode="nearest")[0].permute(1, 2, 0)
     tone_views(again, doubled)
     assert (again.color.float() - after.color.float()).abs().max() <= 2
+
+
+def test_the_disagreement_is_the_mean_difference_over_what_each_view_shows() -> None:
+    shown = texture()
+    views = torch.stack((shown + 0.1, shown, shown))
+    views[1, :, : WIDTH // 2] += 0.2
+    depth = torch.ones((3, HEIGHT, WIDTH))
+    depth[1, :, WIDTH // 2 :] = 0
+    depth[2] = 0
+    assert disagreement(straight_on(views, depth), shown) == pytest.approx((0.1 + 0.2) / 2, abs=2e-3)
+    assert disagreement(straight_on(views, torch.zeros_like(depth)), shown) == 0.0

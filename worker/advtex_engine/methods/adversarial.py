@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advtex_engine.checkpoint import Checkpoints
+from advtex_engine.disagreement import disagreement
 from advtex_engine.discriminator import PatchDiscriminator
 from advtex_engine.errors import Diverged, Problem, Stopped
 from advtex_engine.graphed import Stepper
@@ -91,11 +92,12 @@ def _optimized(
         # Smaller views need less room each.
         on_device = None if given.on_device is None else given.on_device * level.scale**2
         views = pair_views(maps, _pairs(given, maps), on_device, given.config.seed)
+        rate = preset.lr_texture * (disagreement(maps, start) if preset.lr_unit == "disagreement" else 1.0)
         optimizer = AdversarialOptimizer(
             views.maps,
             views.pairs,
             _resized(texture, maps.slot_map.shape)[maps.slot_map >= 0],
-            preset,
+            replace(preset, lr_texture=rate),
             kind=given.scene.kind,
             steps=preset.steps,
             generator=generator,
@@ -161,7 +163,7 @@ def _run_level(
             checkpoints.save({**state, "optimizer": optimizer.state_dict(), "views": views.state_dict()})
         if stop:
             raise Stopped(f"stopped after step {run.step} of {total}; resume goes on from there")
-    given.facts["step"] = stepper.describe()
+    given.facts["step"] = stepper.describe() | {"lr_texture": optimizer.preset.lr_texture}
 
 
 def _check(optimizer: AdversarialOptimizer, losses: Mapping[str, float], run: _Run, total: int) -> None:

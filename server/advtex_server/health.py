@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from dataclasses import dataclass
 
 from redis import RedisError
@@ -35,8 +36,11 @@ def _database(store: Store) -> Check:
     try:
         with store.database.read() as session:
             session.execute(text("select id from jobs limit 1"))
-    except SQLAlchemyError as error:
+        blocked = store.database.blocked()
+    except (SQLAlchemyError, sqlite3.Error) as error:
         return Check("database", False, True, f"the database does not answer: {_first_line(error)}")
+    if blocked is not None:
+        return Check("database", False, True, f"{blocked}: if it is frozen, let it go on or end it")
     return Check("database", True, True)
 
 

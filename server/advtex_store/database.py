@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ POSTGRES_LINE = {"connect_timeout": 5, "tcp_user_timeout": 10_000, "keepalives_i
 POSTGRES_LIMITS = "-c statement_timeout=30s -c lock_timeout=15s -c idle_in_transaction_session_timeout=20s"
 SQLITE_POOL = 40
 SQLITE_WAIT = 30  # seconds, for another connection's lock
+WAL_WRITE_LOCK = "120"  # the byte of the -shm file that a writer locks
 MIGRATION_LOCK = 0x61647674  # any constant that only this service uses as a PostgreSQL advisory lock
 
 
@@ -59,6 +60,24 @@ class Database:
         if self.engine.dialect.name == "sqlite":
             return time.time()
         return float(session.execute(text("select extract(epoch from clock_timestamp())")).scalar_one())
+
+    def blocked(self, seconds: float = 5.0) -> str | None:
+        """Why nobody can write: SQLite's one lock is held for longer than that, by a process that may be frozen.
+
+        None if it is free sooner, and on PostgreSQL, which gives up such transactions by itself.
+        """
+        path = self.engine.url.database
+        if self.engine.dialect.name != "sqlite" or not path:
+            return None
+        with closing(sqlite3.connect(path, timeout=seconds, isolation_level=None)) as connection:
+            try:
+                connection.execute("BEGIN IMMEDIATE").close()
+                connection.execute("ROLLBACK").close()
+            except sqlite3.OperationalError as error:
+                if not _is_busy(error):
+                    raise
+                return f"nobody can write: {_holders(Path(path))} has held SQLite's lock for over {seconds:g} s"
+        return None
 
     def close(self) -> None:
         """Close the connections: those of the pool now, and those that a thread still uses when it lets go of them."""
@@ -99,9 +118,29 @@ def _switch_to_wal(connection: Any) -> None:
             connection.execute("PRAGMA journal_mode=WAL").close()
             return
         except sqlite3.OperationalError as error:
-            if error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY or time.monotonic() > give_up:
+            if not _is_busy(error) or time.monotonic() > give_up:
                 raise
         time.sleep(0.01)
+
+
+def _is_busy(error: sqlite3.OperationalError) -> bool:
+    return error.sqlite_errorcode & 0xFF == sqlite3.SQLITE_BUSY
+
+
+def _holders(path: Path) -> str:
+    """Who holds the write lock, by the kernel's list of locks: a byte of the file beside the database."""
+    try:
+        inode = path.with_name(path.name + "-shm").stat().st_ino
+        locks = [line.split() for line in Path("/proc/locks").read_text().splitlines()]
+    except OSError:
+        return "another process"
+    # number, POSIX, ADVISORY, WRITE, process, device:inode, first byte, last byte; others that wait have "->" in front
+    holders = [
+        lock[4]
+        for lock in locks
+        if len(lock) == 8 and lock[3] == "WRITE" and lock[6] == WAL_WRITE_LOCK and lock[5].endswith(f":{inode}")
+    ]
+    return f"process {holders[0]}" if holders else "another process"
 
 
 def _begin_sqlite(connection: Connection) -> None:

@@ -30,8 +30,8 @@ class Preset:
     pretraining       first steps, counted in `levels`, in which the discriminator learns alone
     lr_texture        1e-3, Adam; colors in [0, 1]. Adam's step is as long however rarely a view shows the texel and
                       however faint its gradient is: it is noise that accumulates while nothing holds it back
-    lr_unit           of lr_texture: "color" (1, as the paper's) or "disagreement", the mean absolute difference of the
-                      views to the start
+    lr_unit           of lr_texture: "color" (1, as the paper's) or "disagreement", the root of the mean absolute
+                      difference of the views to the start
     lr_discriminator  1e-4, Adam
     lr_end            share of both at the last step, reached in a straight line (paper: 1, no decay)
     beta1             0.5
@@ -99,9 +99,10 @@ PAPER = replace(
     # In the paper's case of two dimensions every step shows every texel. Here a view shows a tenth of them: Adam's
     # moments, means over all steps, make a step about 1 / sqrt(.1) times the rate for each time that the texel is seen.
     # Noise adds up with the rate times the root of the number of steps, what the losses agree on with the rate times
-    # that number: small steps to the end. How far a texel has to go is as far as the views disagree, .03 on a kitchen
-    # and .13 on an object of strong colors with wrong cameras, where a rate for kitchens ends half way.
-    lr_texture=1.5e-3,
+    # that number: small steps to the end. How far a texel has to go depends on how far the views disagree, by .03 on a
+    # kitchen and by .13 on an object of strong colors with wrong cameras, where a rate for kitchens ends half way; what
+    # noise costs does not. A rate in proportion speckles where they disagree, an even one blurs: the root lies between.
+    lr_texture=1.8e-4,
     lr_unit="disagreement",
     lr_end=0.0,
     # The warped auxiliary image is displaced by the errors of two cameras, the source by those of one.

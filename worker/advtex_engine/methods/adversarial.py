@@ -92,7 +92,7 @@ def _optimized(
         # Smaller views need less room each.
         on_device = None if given.on_device is None else given.on_device * level.scale**2
         views = pair_views(maps, _pairs(given, maps), on_device, given.config.seed)
-        rate = preset.lr_texture * (disagreement(maps, start) if preset.lr_unit == "disagreement" else 1.0)
+        rate = preset.lr_texture * (disagreement(maps, start) ** 0.5 if preset.lr_unit == "disagreement" else 1.0)
         optimizer = AdversarialOptimizer(
             views.maps,
             views.pairs,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 
 class ErrorCode(StrEnum):
@@ -35,8 +35,6 @@ class ErrorCode(StrEnum):
 class ErrorDetail(BaseModel):
     """One problem: where it is (a field or a file of the scan) and what helps."""
 
-    model_config = ConfigDict(extra="forbid")
-
     severity: Literal["error", "warning", "info"] = "error"
     code: str = ""
     where: str = ""
@@ -46,8 +44,6 @@ class ErrorDetail(BaseModel):
 
 class ErrorBody(BaseModel):
     """The body of every 4xx and 5xx answer."""
-
-    model_config = ConfigDict(extra="forbid")
 
     code: ErrorCode
     message: str

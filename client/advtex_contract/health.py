@@ -5,21 +5,17 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel
 
 
 class Alive(BaseModel):
     """Body of `GET /healthz`."""
-
-    model_config = ConfigDict(extra="forbid")
 
     status: Literal["ok"] = "ok"
 
 
 class PartView(BaseModel):
     """One part of the service. `essential`: without it no work can be accepted. `message`: what is wrong, in words."""
-
-    model_config = ConfigDict(extra="forbid")
 
     ok: bool
     essential: bool
@@ -28,8 +24,6 @@ class PartView(BaseModel):
 
 class Readiness(BaseModel):
     """Body of `GET /readyz`: whether work can be accepted, and how each part is."""
-
-    model_config = ConfigDict(extra="forbid")
 
     ready: bool
     checks: dict[str, PartView]
@@ -40,8 +34,6 @@ class KeyView(BaseModel):
 
     active_jobs, bytes: what its owner has of what is limited. Limits are null where there are none.
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     id: str
     scopes: list[str]

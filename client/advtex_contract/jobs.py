@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import datetime
 from enum import StrEnum
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints, model_validator
 
 from advtex_contract.errors import ErrorDetail
 from advtex_contract.options import JobOptions
@@ -68,8 +69,6 @@ class Progress(BaseModel):
     warning, in words.
     """
 
-    model_config = ConfigDict(extra="forbid")
-
     stage: str = ""
     step: int = 0
     steps: int = 0
@@ -85,8 +84,6 @@ class Progress(BaseModel):
 class ResultFile(BaseModel):
     """A file of a finished job, downloadable at `url` (path on the same server) with Range requests."""
 
-    model_config = ConfigDict(extra="forbid")
-
     name: str
     size: int
     sha256: str
@@ -97,12 +94,17 @@ class ResultFile(BaseModel):
 class JobError(BaseModel):
     """Why a job failed or was rejected, in words, with the remedy and the log's tail."""
 
-    model_config = ConfigDict(extra="forbid")
-
     code: str
     message: str
     details: list[ErrorDetail] = Field(default_factory=list)
     log_tail: str = ""
+
+
+def known_options(stored: object) -> object:
+    """Options as they were stored, without those that only another version knows."""
+    if not isinstance(stored, Mapping):
+        return stored
+    return {name: value for name, value in stored.items() if name in JobOptions.model_fields}
 
 
 class JobView(BaseModel):
@@ -114,15 +116,13 @@ class JobView(BaseModel):
     retention_seconds: how long it is kept after its end; then `expires_at` is known.
     """
 
-    model_config = ConfigDict(extra="forbid")
-
     id: str
     state: JobState
     label: str = ""
     upload_id: str
     source: str | None = None
     batch: str | None = None
-    options: JobOptions
+    options: Annotated[JobOptions, BeforeValidator(known_options)]
     priority: int = 0
     attempt: int = 0
     waiting_reason: str = ""
@@ -141,8 +141,6 @@ class JobView(BaseModel):
 class JobPage(BaseModel):
     """A page of jobs, newest first; `next_cursor` is null on the last one."""
 
-    model_config = ConfigDict(extra="forbid")
-
     jobs: list[JobView]
     next_cursor: str | None = None
 
@@ -152,8 +150,6 @@ class BatchView(BaseModel):
 
     eta_seconds: until all have ended, at the step rates that were measured; null while nothing was, and in lists.
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     id: str
     jobs: int
@@ -167,16 +163,12 @@ class BatchView(BaseModel):
 class BatchPage(BaseModel):
     """A page of batches, newest first; `next_cursor` is null on the last one."""
 
-    model_config = ConfigDict(extra="forbid")
-
     batches: list[BatchView]
     next_cursor: str | None = None
 
 
 class UploadView(BaseModel):
     """An upload: complete once `offset == size` and its sha256 is known."""
-
-    model_config = ConfigDict(extra="forbid")
 
     id: str
     size: int
@@ -191,15 +183,11 @@ class UploadView(BaseModel):
 class UploadList(BaseModel):
     """Uploads that have the same bytes, the most useful one first."""
 
-    model_config = ConfigDict(extra="forbid")
-
     uploads: list[UploadView]
 
 
 class StorageInfo(BaseModel):
     """What the server accepts at most, and how long it keeps things (seconds)."""
-
-    model_config = ConfigDict(extra="forbid")
 
     max_upload_bytes: int
     retention_seconds: int

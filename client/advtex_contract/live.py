@@ -12,8 +12,6 @@ Series = Annotated[dict[str, list[float | None]], Field(max_length=20)]
 class CurveSet(BaseModel):
     """Values by name, one per step; null where there is none."""
 
-    model_config = ConfigDict(extra="forbid")
-
     steps: list[int] = Field(default_factory=list, max_length=1000)
     series: Series = Field(default_factory=dict)
 
@@ -28,7 +26,7 @@ class Curves(CurveSet):
 class LivePicture(BaseModel):
     """A small JPEG of the model; `view` is the name of the frame that it compares with."""
 
-    model_config = ConfigDict(extra="forbid", ser_json_bytes="base64", val_json_bytes="base64")
+    model_config = ConfigDict(ser_json_bytes="base64", val_json_bytes="base64")
 
     name: str = Field(pattern=r"^[0-9A-Za-z_-]{1,40}\.jpg$")
     view: str = Field(max_length=1000)
@@ -38,8 +36,6 @@ class LivePicture(BaseModel):
 class LiveRecord(BaseModel):
     """A look at a running job, as its worker stores it."""
 
-    model_config = ConfigDict(extra="forbid")
-
     step: int
     curves: Curves
     pictures: list[LivePicture] = Field(max_length=4)
@@ -47,8 +43,6 @@ class LiveRecord(BaseModel):
 
 class LiveImage(BaseModel):
     """A picture of a `LiveView` and the path on the same server where it is."""
-
-    model_config = ConfigDict(extra="forbid")
 
     name: str
     view: str
@@ -58,8 +52,6 @@ class LiveImage(BaseModel):
 class LiveView(BaseModel):
     """A running job's texture after `step`, renewed every few seconds; empty where there is nothing to see yet, and
     once the job has its results."""
-
-    model_config = ConfigDict(extra="forbid")
 
     step: int = 0
     curves: Curves = Curves()

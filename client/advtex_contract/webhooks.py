@@ -27,8 +27,6 @@ class WebhookView(BaseModel):
     failures, last_error: tries in a row that failed, and why the last one did; too many disable the webhook.
     """
 
-    model_config = ConfigDict(extra="forbid")
-
     id: str
     url: str
     events: list[JobState]
@@ -42,15 +40,11 @@ class WebhookView(BaseModel):
 class WebhookList(BaseModel):
     """All webhooks of an owner, oldest first."""
 
-    model_config = ConfigDict(extra="forbid")
-
     webhooks: list[WebhookView]
 
 
 class JobEventError(BaseModel):
     """Why a job failed or was rejected, without the details that the job itself has."""
-
-    model_config = ConfigDict(extra="forbid")
 
     code: str
     message: str
@@ -58,8 +52,6 @@ class JobEventError(BaseModel):
 
 class JobEventData(BaseModel):
     """The job at the time of the event; `GET /v1/jobs/{id}` has all of it."""
-
-    model_config = ConfigDict(extra="forbid")
 
     id: str
     state: JobState
@@ -70,8 +62,6 @@ class JobEventData(BaseModel):
 
 class JobEvent(BaseModel):
     """What a receiver gets: `type` is `job.` and the state, `timestamp` is when it began."""
-
-    model_config = ConfigDict(extra="forbid")
 
     type: str
     timestamp: datetime

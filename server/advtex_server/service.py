@@ -25,6 +25,7 @@ from advtex_contract.jobs import (
     Progress,
     ResultFile,
     StorageInfo,
+    known_options,
 )
 from advtex_contract.live import LiveImage, LiveRecord, LiveView
 from advtex_contract.options import JobOptions
@@ -265,7 +266,7 @@ def job_view(row: JobRow) -> JobView:
         upload_id=row.upload_id,
         source=row.source,
         batch=row.batch,
-        options=JobOptions.model_validate(row.options),
+        options=JobOptions.model_validate(known_options(row.options)),
         priority=row.priority,
         attempt=row.attempt - 1 if state in WAITING else row.attempt,
         waiting_reason=(row.waiting_reason or IN_LINE) if state in WAITING else paused,

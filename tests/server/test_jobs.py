@@ -17,6 +17,7 @@ from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from advtex_contract.jobs import JobError, JobPage, JobView, Progress
 from advtex_server.events import FRESH_SECONDS, Lookout
 from advtex_store.errors import RecordNotFound, StaleAttempt
+from advtex_store.models import JobRow
 from advtex_store.needs import needed_memory
 
 
@@ -393,3 +394,20 @@ def test_streams_of_one_job_share_a_look(live: Any, monkeypatch: pytest.MonkeyPa
 
     asyncio.run(looks())
     assert sorted(reads) == ["me", "me", "you"]
+
+
+def test_rows_of_a_newer_version_are_shown(live: Any) -> None:
+    """While servers of two versions run side by side."""
+    job = live.job(live.upload())["id"]
+    more = {"from_the_future": 1}
+    with live.store.database.write() as session:
+        row = session.get(JobRow, job)
+        row.options = row.options | more
+        row.progress = row.progress | more
+        row.warnings = [{"message": "m", **more}]
+        row.error = {"code": "c", "message": "m", **more}
+    shown = live.http.get(f"/v1/jobs/{job}")
+    assert shown.status_code == 200
+    assert "from_the_future" not in shown.text
+    assert [warning["message"] for warning in shown.json()["warnings"]] == ["m"]
+    assert live.http.get("/v1/jobs").status_code == 200

@@ -1,0 +1,60 @@
+"""Older and newer versions read each other: what is told and stored is open, what is sent is not."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import pytest
+from pydantic import BaseModel, ValidationError
+
+from advtex_contract import errors, health, jobs, live, options, webhooks
+
+SENT = {jobs.JobSpec, options.JobOptions, webhooks.WebhookSpec}
+MODELS = sorted(
+    {
+        model
+        for module in (errors, health, jobs, live, options, webhooks)
+        for _, model in inspect.getmembers(module, inspect.isclass)
+        if issubclass(model, BaseModel) and model.__module__ == module.__name__
+    },
+    key=lambda model: model.__name__,
+)
+JOB: dict[str, Any] = {
+    "id": "a",
+    "state": "queued",
+    "upload_id": "u",
+    "options": {"preset": "paper", "from_the_future": 1},
+    "progress": {"stage": "atlas", "from_the_future": 1},
+    "warnings": [{"message": "m", "from_the_future": 1}],
+    "error": {"code": "c", "message": "m", "from_the_future": 1},
+    "results": [],
+    "created_at": "2026-01-01T00:00:00Z",
+    "updated_at": "2026-01-01T00:00:00Z",
+    "from_the_future": 1,
+}
+
+
+@pytest.mark.parametrize("model", MODELS, ids=lambda model: model.__name__)
+def test_what_is_sent_is_closed_and_all_else_is_open(model: type[BaseModel]) -> None:
+    assert (model.model_config.get("extra") == "forbid") == (model in SENT)
+
+
+def test_a_job_of_a_newer_version_is_read() -> None:
+    view = jobs.JobView.model_validate(JOB)
+    assert view.options == options.JobOptions(preset=options.Preset.paper)
+    assert view.progress.stage == "atlas"
+    assert view.error is not None
+    assert view.error.code == "c"
+
+
+def test_a_job_of_an_older_version_is_read() -> None:
+    least = {key: JOB[key] for key in ("id", "state", "upload_id", "created_at", "updated_at")}
+    view = jobs.JobView.model_validate(least | {"options": {}, "progress": {}})
+    assert view.options == options.JobOptions()
+    assert view.progress == jobs.Progress()
+
+
+def test_options_that_are_sent_are_refused_where_they_are_not_known() -> None:
+    with pytest.raises(ValidationError, match="from_the_future"):
+        jobs.JobSpec.model_validate({"upload_id": "u", "options": {"from_the_future": 1}})

@@ -95,6 +95,7 @@ FROM_MEAN: dict[str, Any] = {
     "toned": False,
     "lr_texture": 1e-3,
     "lr_unit": "color",
+    "lr_discriminator": 1e-4,
     "l1_target": "auxiliary",
     "lr_end": 1.0,
     "nearest_share": 1.0,

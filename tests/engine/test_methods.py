@@ -16,6 +16,7 @@ from torch import Tensor
 from advtex_engine.checkpoint import WorkFolder
 from advtex_engine.config import METHODS as METHOD_NAMES
 from advtex_engine.config import PRINTED, PyramidLevel, TextureConfig
+from advtex_engine.disagreement import disagreement
 from advtex_engine.discriminator import PatchDiscriminator
 from advtex_engine.errors import Stopped
 from advtex_engine.live import Live
@@ -278,6 +279,16 @@ def test_the_ablations_run_and_differ(name: str, around: MethodInput) -> None:
     if name != "adversarial":
         whole, _ = METHODS["adversarial"](replace(around, work=WorkFolder(around.work.path / "2", "", Monitor())))
         assert not torch.equal(texture, whole)
+
+
+def test_a_rate_may_be_in_units_of_the_views_disagreement(around: MethodInput, tmp_path: Path) -> None:
+    units = {"color": 1.0, "disagreement": disagreement(around.maps[1], around.means[1]) ** 0.5}
+    assert 0 < units["disagreement"] < 0.5
+    for unit, size in units.items():
+        preset = replace(around.preset, start="mean", lr_texture=2e-3, lr_unit=unit)
+        given = replace(around, preset=preset, work=WorkFolder(tmp_path / unit, "", Monitor()))
+        METHODS["adversarial"](given)
+        assert given.facts["step"]["lr_texture"] == pytest.approx(2e-3 * size)
 
 
 def feature_weights() -> dict[str, Tensor]:

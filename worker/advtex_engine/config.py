@@ -104,6 +104,9 @@ PAPER = replace(
     # noise costs does not. A rate in proportion speckles where they disagree, an even one blurs: the root lies between.
     lr_texture=1.8e-4,
     lr_unit="disagreement",
+    # A discriminator that learns faster than the texture moves is ahead for good, and what it asks for leads away from
+    # the photographs.
+    lr_discriminator=2e-5,
     lr_end=0.0,
     # The warped auxiliary image is displaced by the errors of two cameras, the source by those of one.
     l1_target="source",

@@ -9,6 +9,7 @@ from typing import Any
 import compiled
 import discriminator
 import examples
+import game
 import harness
 import paper
 import parts
@@ -225,6 +226,31 @@ def test_the_paper_s_method_stands_beside_its_peers_and_its_suspects(
 
     monkeypatch.setattr(paper, "prepare", lambda *_: pytest.fail("every cell is there already"))
     paper.main(line)
+
+
+@pytest.mark.slow
+def test_the_game_ends_where_the_run_ends(tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synthesize(tmp_path / "desk", views=6, width=96, height=64)
+    for module in (paper, game):
+        for name, value in {"SIZE": "64x64", "VIEWS": 6, "FACES": 600, "SCAN_FACES": 600, "HOLDOUT": 3}.items():
+            monkeypatch.setattr(module, name, value)
+    line = [str(tmp_path / "desk"), "--scan-size", "96x64", "--errors", "cameras", "--levels", "1", "--steps", "4"]
+    line += ["--device", "cpu", "--lpips-weights", str(weights)]
+    paper.main([*line, "--rows", "adversarial", "--results", str(tmp_path / "paper")])
+    changed = ["--change", "start=selection", "lr_texture=1e-2"]
+    for change in ([], changed):
+        game.main([*line, "--points", "2", *change, "--results", str(tmp_path / "game")])
+    cells = json.loads((tmp_path / "game" / "game.json").read_text())["cells"]
+    assert [cell["settings"]["step"] for cell in cells] == [0, 2, 4] * 4
+    usual = [cell for cell in cells if not cell["settings"]["changes"]]
+    assert [cell["scores"]["lpips"] for cell in usual] != [cell["scores"]["lpips"] for cell in cells[6:]]
+    ends = {cell["settings"]["scan"]: cell["scores"] for cell in usual if cell["settings"]["step"] == 4}
+    for cell in json.loads((tmp_path / "paper" / "paper.json").read_text())["cells"]:
+        assert ends[cell["settings"]["scan"]]["lpips"] == pytest.approx(cell["scores"]["lpips"], abs=1e-6)
+    page = (tmp_path / "game" / "game.md").read_text()
+    assert "## desk, 96x64, 4 steps, start=selection lr_texture=1e-2" in page
+    with pytest.raises(SystemExit, match="--change rate: the preset has no such number"):
+        game.main([*line, "--change", "rate=1", "--results", str(tmp_path / "game")])
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advtex_engine.checkpoint import Checkpoints
+from advtex_engine.config import Preset
 from advtex_engine.disagreement import disagreement
 from advtex_engine.discriminator import PatchDiscriminator
 from advtex_engine.errors import Diverged, Problem, Stopped
@@ -91,13 +92,12 @@ def _optimized(
         maps = given.maps[level.scale]
         # Smaller views need less room each.
         on_device = None if given.on_device is None else given.on_device * level.scale**2
-        views = pair_views(maps, _pairs(given, maps), on_device, given.config.seed)
-        rate = preset.lr_texture * (disagreement(maps, start) ** 0.5 if preset.lr_unit == "disagreement" else 1.0)
+        views = pair_views(maps, pairs_of(given, maps), on_device, given.config.seed)
         optimizer = AdversarialOptimizer(
             views.maps,
             views.pairs,
             _resized(texture, maps.slot_map.shape)[maps.slot_map >= 0],
-            replace(preset, lr_texture=rate),
+            rated(preset, maps, start),
             kind=given.scene.kind,
             steps=preset.steps,
             generator=generator,
@@ -125,7 +125,15 @@ def adversarial_no_condition(given: MethodInput) -> tuple[Tensor, list[LossPoint
     return adversarial(replace(given, preset=replace(given.preset, condition=False)))
 
 
-def _pairs(given: MethodInput, maps: ViewMaps) -> Pairs:
+def rated(preset: Preset, maps: ViewMaps, start: Tensor) -> Preset:
+    """The preset with the texture's rate in colors; start: dense [H,W,3] in [0,1]."""
+    if preset.lr_unit == "color":
+        return preset
+    return replace(preset, lr_texture=preset.lr_texture * disagreement(maps, start) ** 0.5, lr_unit="color")
+
+
+def pairs_of(given: MethodInput, maps: ViewMaps) -> Pairs:
+    """Which views the preset pairs with each other."""
     if not given.preset.auxiliary:
         return own_pairs(maps)
     preset = given.preset

@@ -95,9 +95,8 @@ FROM_MEAN: dict[str, Any] = {
     "toned": False,
     "lr_texture": 1e-3,
     "lr_unit": "color",
-    "lr_discriminator": 1e-4,
     "l1_target": "auxiliary",
-    "lr_end": 1.0,
+    "lr_follows": 0.0,
     "nearest_share": 1.0,
 }
 """As printed, but for the start: black takes thousands of steps to get away from, and hides all else in short runs."""
@@ -113,7 +112,7 @@ SUSPECTS = {
     "from the mean, wider pairs": Row(preset={**FROM_MEAN, "max_pair_angle": 30.0}),
     "from the mean, closer pairs": Row(preset={**FROM_MEAN, "min_pair_overlap": 0.7}),
     "from the mean, nearest half": Row(preset={**FROM_MEAN, "nearest_share": 0.5}),
-    "an even rate": Row(preset={"lr_end": 1.0}),
+    "an even rate": Row(preset={"lr_follows": 0.0}),
     "views as photographed": Row(preset={"toned": False}),
     "all pairs": Row(preset={"nearest_share": 1.0}),
     "L1 to the auxiliary": Row(preset={"l1_target": "auxiliary"}),

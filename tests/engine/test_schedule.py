@@ -29,6 +29,14 @@ def test_the_learning_rates_fall_in_a_straight_line_after_the_pretraining() -> N
     assert [late.pretraining_at(index) for index in (0, 9, 10)] == [True, True, False]
 
 
+def test_the_textures_rate_falls_by_a_power_of_lambdas_decay() -> None:
+    of = schedule(20, dataclasses.replace(PRINTED, l1_decays=4, lr_texture=0.1, lr_follows=0.5))
+    column = COLUMNS.index("lr_texture")
+    rates = [of.row_at(index)[column] for index in (0, 4, 5, 10, 19)]
+    assert rates == pytest.approx([0.1, 0.1, 0.1 * 0.8**0.5, 0.08, 0.1 * 0.8**1.5])
+    assert {of.row_at(index)[COLUMNS.index("lr_discriminator")] for index in range(20)} == {PRINTED.lr_discriminator}
+
+
 def test_the_average_takes_every_tenth_state_after_the_pretraining() -> None:
     of = schedule(60, dataclasses.replace(PRESET, pretraining=2, averaging=30))
     weights = {index: of.average_weight_at(index) for index in range(60) if of.average_weight_at(index)}

@@ -33,6 +33,7 @@ class Preset:
     lr_unit           of lr_texture: "color" (1, as the paper's) or "disagreement", the root of the mean absolute
                       difference of the views to the start
     lr_discriminator  1e-4, Adam
+    lr_follows        power of lambda's decay by which the texture's rate falls (paper: 0, not at all)
     lr_end            share of both at the last step, reached in a straight line (paper: 1, no decay)
     beta1             0.5
     l1_weight         lambda = 10 at the start
@@ -60,6 +61,7 @@ class Preset:
     lr_texture: float = 1e-3
     lr_unit: Literal["color", "disagreement"] = "color"
     lr_discriminator: float = 1e-4
+    lr_follows: float = 0.0
     lr_end: float = 1.0
     beta1: float = 0.5
     l1_weight: float = 10.0
@@ -98,16 +100,14 @@ PAPER = replace(
     toned=True,
     # In the paper's case of two dimensions every step shows every texel. Here a view shows a tenth of them: Adam's
     # moments, means over all steps, make a step about 1 / sqrt(.1) times the rate for each time that the texel is seen.
-    # Noise adds up with the rate times the root of the number of steps, what the losses agree on with the rate times
-    # that number: small steps to the end. How far a texel has to go depends on how far the views disagree, by .03 on a
-    # kitchen and by .13 on an object of strong colors with wrong cameras, where a rate for kitchens ends half way; what
-    # noise costs does not. A rate in proportion speckles where they disagree, an even one blurs: the root lies between.
-    lr_texture=1.8e-4,
+    # How far a texel has to go depends on how far the views disagree, by .03 on a kitchen and by .13 on an object of
+    # strong colors with wrong cameras, where a rate for kitchens ends half way; what the noise of the steps costs does
+    # not. A rate in proportion speckles where they disagree, an even one blurs: the root lies between.
+    lr_texture=6e-4,
     lr_unit="disagreement",
-    # A discriminator that learns faster than the texture moves is ahead for good, and what it asks for leads away from
-    # the photographs.
-    lr_discriminator=2e-5,
-    lr_end=0.0,
+    # Steps pay while lambda holds them together. Later noise adds up, and the texture drifts from the photographs to
+    # all that the discriminator has not learned to tell from them.
+    lr_follows=0.5,
     # The warped auxiliary image is displaced by the errors of two cameras, the source by those of one.
     l1_target="source",
     # A texture that cannot be told from the real examples is as far from the photographs as they are: on two kitchens

@@ -62,7 +62,7 @@ class Schedule:
         share, preset = self.lr_share_at(index), self.preset
         return (
             self.l1_weight_at(index),
-            preset.lr_texture * share,
+            preset.lr_texture * share * self.l1_decay_at(index) ** preset.lr_follows,
             preset.lr_discriminator * share,
             float(self.pretraining_at(index)),
             self.average_weight_at(index),
@@ -70,8 +70,11 @@ class Schedule:
 
     def l1_weight_at(self, index: int) -> float:
         """lambda: l1_weight times l1_decay for each passed period; the paper's 1,000 of 50,000 steps are one period."""
-        periods = int(index * self.preset.l1_decays / self.steps)
-        return self.preset.l1_weight * self.preset.l1_decay**periods
+        return self.preset.l1_weight * self.l1_decay_at(index)
+
+    def l1_decay_at(self, index: int) -> float:
+        """lambda as a share of what it was at the start."""
+        return self.preset.l1_decay ** int(index * self.preset.l1_decays / self.steps)
 
     def pretraining_at(self, index: int) -> bool:
         """Whether the texture still waits for the discriminator."""

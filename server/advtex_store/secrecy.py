@@ -16,6 +16,7 @@ PASSED_ON = frozenset(
     )
 )
 PASSED_ON_BEGINNINGS = (
+    "ADVTEX_ENGINE_",  # what an operator has to tell an engine
     *("LC_", "LD_", "DYLD_", "PYTHON", "MALLOC_", "XDG_"),
     *("CUDA_", "CUDNN_", "NVIDIA_", "CUBLAS_", "TORCH", "PYTORCH_", "TRITON_"),
     *("OMP_", "MKL_", "KMP_", "GOMP_", "OPENBLAS_", "ATEN_", "DNNL_", "ONEDNN_"),

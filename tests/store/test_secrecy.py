@@ -19,6 +19,7 @@ def test_children_get_what_is_on_the_list_and_no_secrets() -> None:
         "PATH": "/bin",
         "ADVTEX_VGG_WEIGHTS": "/weights",
         "ADVTEX_LPIPS_WEIGHTS": "/weights",
+        "ADVTEX_ENGINE_CACHE": "/cache",
         "PYTHONPATH": "/lib",
         "CUDA_HOME": "/cuda",
         "OMP_NUM_THREADS": "2",

@@ -98,7 +98,7 @@ def make_result(folder: Path) -> Path:
 def browsing(folder: Path) -> Iterator[Browsing]:
     """With one worker, whose engine is `page_engines.engine`."""
     binary = chromium()
-    settings = {"PAGE_RESULT": str(make_result(folder)), "ADVTEX_AUTH_FAILURES_PER_MINUTE": "1000"}
+    settings = {"ADVTEX_ENGINE_PAGE_RESULT": str(make_result(folder)), "ADVTEX_AUTH_FAILURES_PER_MINUTE": "1000"}
     with live_service(folder, settings=settings) as service:
         service.start_worker("page_engines:engine")
         with TcpProxy(urlsplit(service.url).port or 0) as proxy, sync_playwright() as playwright:

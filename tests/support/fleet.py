@@ -137,7 +137,7 @@ class Fleet:
     def _start(self, command: list[str], variables: Mapping[str, str]) -> subprocess.Popen[bytes]:
         path = os.pathsep.join(str(Path(entry).absolute()) for entry in (*sys.path, SUPPORT) if entry)
         kept = {name: value for name, value in os.environ.items() if not name.startswith(("ADVTEX_", "AWS_"))}
-        environment = {**kept, **RHYTHM, **variables, "PYTHONPATH": path, "JOURNAL": str(self.journal)}
+        environment = {**kept, **RHYTHM, **variables, "PYTHONPATH": path, "ADVTEX_ENGINE_JOURNAL": str(self.journal)}
         with (self.redis_log if command[0] == redis_binary() else self.log).open("ab") as log:
             return subprocess.Popen(command, env=environment, stdout=log, stderr=log)
 

@@ -79,8 +79,8 @@ def _steps(out: Path, steps: int, path: Path, resume: bool, monitor: Monitor, to
 
 
 def journaled(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
-    """Like `stepping`, but every step is told to the file $ADVTEX_ENGINE_JOURNAL with the time and the attempt (the workspace's
-    name). By its seed a job dies in every attempt (seed % 20 == 7), or is rejected (13)."""
+    """Like `stepping`, but every step is told to the file $ADVTEX_ENGINE_JOURNAL with the time and the attempt (the
+    workspace's name). By its seed a job dies in every attempt (seed % 20 == 7), or is rejected (13)."""
     journal = os.open(os.environ["ADVTEX_ENGINE_JOURNAL"], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
 
     if config.seed % 20 == 7:

@@ -17,7 +17,7 @@ CURVES = {"steps": [1, 2, 3], "series": {"l1": [0.3, 0.2, 0.1]}, "quality": {"st
 
 
 def engine(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
-    """A glimpse, `config.steps` steps of 10 ms, then the files of $ADVTEX_ENGINE_PAGE_RESULT. With the seed FAILS it fails."""
+    """A glimpse, `config.steps` steps of 10 ms, then the files of $ADVTEX_ENGINE_PAGE_RESULT; an error with FAILS."""
     result = Path(os.environ["ADVTEX_ENGINE_PAGE_RESULT"])
     if config.seed == FAILS:
         print("looking for the widget", file=sys.stderr, flush=True)

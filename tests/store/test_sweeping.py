@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,8 @@ class World:
     def __init__(self, bench: Any, blobs: Interrupted, folder: Path, data: st.DataObject) -> None:
         self.bench, self.blobs, self.data = bench, blobs, data
         self.retention = Retention(bench.database, blobs)
+        # The world goes on inside of what is guarded: nothing that it finds amiss may be passed over.
+        self.retention.troubles.of = lambda *_: nullcontext()  # type: ignore[method-assign]
         self.results = Results(bench.records, blobs)
         self.file = folder / "file"
         self.file.write_bytes(b"result")

@@ -56,8 +56,11 @@ def told(log: Path) -> list[dict[str, Any]]:
 @pytest.mark.one_machine("about the lines of a log")
 def test_the_command_logs_json(start: Start, log: Path) -> None:
     start("-m", "advtex_worker.main")
-    wait_until(lambda: log.read_text().count("\n") >= 2, seconds=60)
-    assert [line["event"] for line in told(log)] == ["worker begins", "worker takes jobs"]
+    wait_until(lambda: "takes jobs" in log.read_text(), seconds=60)
+    events = [line["event"] for line in told(log)]
+    if os.geteuid() == 0:
+        assert "passwords included" in events.pop(0)
+    assert events == ["worker begins", "worker takes jobs"]
 
 
 @pytest.mark.one_machine("about the lines of a log")

@@ -1,8 +1,8 @@
 """What a worker must have for a job. Estimated without the engine, from runs of it that were measured.
 
 Peak memory of 18 runs on CPUs (44 to 62 views at 320x240 and 640x480, all methods) was never above this estimate. The
-engine counts its own need by part (`advtex_engine/memory.py`) once it knows the scene; what is asked for here is never
-less. On GPUs the base covers CUDA's own context.
+engine counts its own need by part (`advtex_engine/budget/workload.py`) once it knows the scene; what is asked for here
+is never less. On GPUs the base covers CUDA's own context.
 """
 
 from __future__ import annotations

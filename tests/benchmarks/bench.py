@@ -21,7 +21,7 @@ from typing import Any
 
 from harness import RESULTS, markdown_table
 
-from advtex_engine.files import write_atomically
+from advtex_engine.runtime.files import write_atomically
 
 WANTED = ("NVIDIA H200",)
 """Devices that figures are promised for: without one at hand, their rows stay empty."""
@@ -80,7 +80,7 @@ def page(cells: Sequence[Cell]) -> str:
 
 INTRODUCTION = """\
 Floors: bytes over the speed of a large copy plus operations over that of a large matrix product, both measured in the
-same run (`advtex_engine/bench_counts.py` says what is counted). Load: of the whole machine, in the minute before the
+same run (`advtex_engine/bench/counts.py` says what is counted). Load: of the whole machine, in the minute before the
 run; where it is near the number of cores or above, other work took its share, and the figures say little but the
 ratios within one run. On a CPU nothing is uploaded. On a GPU parts are timed by events while the step waits in the
 device's queue, so that they are kernels and not launches.

@@ -20,13 +20,14 @@ from pathlib import Path
 import torch
 from harness import RESULTS, markdown_table
 
-from advtex_engine.bench import full_optimizer
-from advtex_engine.bench_scene import made_scene
-from advtex_engine.config import PRESETS
-from advtex_engine.devices import choose_device, wait_for
-from advtex_engine.files import write_atomically
-from advtex_engine.optimize import AdversarialOptimizer
-from advtex_engine.views import Pairs, ViewMaps, build_view_maps, related_pairs
+from advtex_engine.adversarial.optimizer import AdversarialOptimizer
+from advtex_engine.bench.run import full_optimizer
+from advtex_engine.bench.scene import made_scene
+from advtex_engine.core.config import PRESETS
+from advtex_engine.render.pairs import Pairs, related_pairs
+from advtex_engine.render.view_maps import ViewMaps, build_view_maps
+from advtex_engine.runtime.devices import choose_device, wait_for
+from advtex_engine.runtime.files import write_atomically
 
 FACES, VIEWS = 20_000, 16
 ROUNDS, STEPS = 8, 5

@@ -37,14 +37,14 @@ from harness import (
 )
 from torch import Tensor, nn
 
-from advtex_engine.discriminator import STRIDES, PatchDiscriminator
+from advtex_engine.adversarial.discriminator import STRIDES, PatchDiscriminator
+from advtex_engine.adversarial.optimizer import AdversarialOptimizer
 from advtex_engine.methods import MethodInput
 from advtex_engine.methods.mean import dense_texture
-from advtex_engine.optimize import AdversarialOptimizer
-from advtex_engine.perceptual import Lpips
+from advtex_engine.metrics.lpips import Lpips
 from advtex_engine.pipeline import choose_device
-from advtex_engine.synthesize import synthesize
-from advtex_engine.views import own_pairs, related_pairs
+from advtex_engine.render.pairs import own_pairs, related_pairs
+from advtex_engine.synthetic.scan import synthesize
 
 PATCHES = {22: (1, 1), 70: (4, 1), 118: (4, 2)}
 """Receptive field in pixels: kernel and dilation of the two convolutions that have stride 1."""

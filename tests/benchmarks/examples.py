@@ -38,15 +38,16 @@ from paper import FACES, HOLDOUT, SCAN_FACES, SCAN_SIZE, SIZE, TURN, VIEWS
 from study import make_scan
 from torch import Tensor
 
-from advtex_engine.config import PAPER, TextureConfig
-from advtex_engine.evaluate import Comparison, score
+from advtex_engine.core.config import PAPER, TextureConfig
 from advtex_engine.methods import MethodInput
-from advtex_engine.metrics import gradient_ratio
-from advtex_engine.perceptual import Lpips
+from advtex_engine.metrics.evaluate import Comparison, score
+from advtex_engine.metrics.image_metrics import gradient_ratio
+from advtex_engine.metrics.lpips import Lpips
 from advtex_engine.pipeline import choose_device
-from advtex_engine.reproject import reproject, unproject_pixels
-from advtex_engine.texture import bilinear_footprint, decode_uv, sample_texels
-from advtex_engine.views import DEPTH_TOLERANCE, ViewMaps, overlaps, related_pairs
+from advtex_engine.render.pairs import overlaps, related_pairs
+from advtex_engine.render.reproject import reproject, unproject_pixels
+from advtex_engine.render.texture import bilinear_footprint, decode_uv, sample_texels
+from advtex_engine.render.view_maps import DEPTH_TOLERANCE, ViewMaps
 
 TEXTURES = ("l1", "view_selection")
 KEPT = {"kept": True, "left out": False}

@@ -42,16 +42,16 @@ from paper import FACES, HOLDOUT, SCAN_FACES, SCAN_SIZE, SIZE, TURN, VIEWS
 from study import make_scan
 from torch import Tensor
 
-from advtex_engine.config import PRESETS, Preset, TextureConfig
-from advtex_engine.discriminator import PatchDiscriminator
+from advtex_engine.adversarial.discriminator import PatchDiscriminator
+from advtex_engine.adversarial.optimizer import AdversarialOptimizer
+from advtex_engine.core.config import PRESETS, Preset, TextureConfig, resolve_preset
 from advtex_engine.methods import MethodInput
 from advtex_engine.methods.adversarial import pairs_of, rated
 from advtex_engine.methods.mean import dense_texture
-from advtex_engine.optimize import AdversarialOptimizer
-from advtex_engine.perceptual import Lpips
-from advtex_engine.pipeline import choose_device, resolve_preset
-from advtex_engine.speckle import speckle_share
-from advtex_engine.texture import fill_holes
+from advtex_engine.metrics.lpips import Lpips
+from advtex_engine.metrics.speckle import speckle_share
+from advtex_engine.render.texture import fill_holes
+from advtex_engine.runtime.devices import choose_device
 
 TABLE = {
     "discriminator": "discriminator's loss",
@@ -166,7 +166,7 @@ def _input(
         device=arguments.device,
     )
     given = prepare(scan, config, folder / "work", device)
-    preset = dataclasses.replace(resolve_preset(config, device), **changes(arguments.change))
+    preset = dataclasses.replace(resolve_preset(config, device.type), **changes(arguments.change))
     return dataclasses.replace(given, preset=preset)
 
 

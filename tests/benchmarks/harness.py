@@ -26,30 +26,30 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from advtex_engine.atlas import build_atlas
-from advtex_engine.checkpoint import WorkFolder
-from advtex_engine.config import TextureConfig
-from advtex_engine.evaluate import PATCH_METRICS, VIEW_METRICS, Comparison, evaluate, score
-from advtex_engine.export import export_model
-from advtex_engine.files import write_atomically
-from advtex_engine.geometry import clean, decimate
-from advtex_engine.ingest import ingest
-from advtex_engine.live import Live
+from advtex_engine.atlas.build import build_atlas
+from advtex_engine.core.config import TextureConfig, resolve_preset
+from advtex_engine.core.monitor import Monitor
+from advtex_engine.core.scene import Atlas, Camera, Mesh, View
+from advtex_engine.ingest.read import ingest
+from advtex_engine.mesh.clean import clean, decimate
+from advtex_engine.mesh.models import load_model
 from advtex_engine.methods import METHODS, MethodInput
 from advtex_engine.methods.adversarial import starting_texture
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.view_selection import select_views
-from advtex_engine.models import load_model
-from advtex_engine.monitor import Monitor
-from advtex_engine.perceptual import Lpips, WeightsError, load_lpips
-from advtex_engine.pipeline import resolve_preset
-from advtex_engine.previews import contact_sheet, render_layers, render_view
-from advtex_engine.refine import apply_refinement, refine_cameras
-from advtex_engine.scene import Atlas, Camera, Mesh, View
-from advtex_engine.synthesize import SUPERSAMPLE, TRUTH
-from advtex_engine.texture import fill_holes
-from advtex_engine.toning import tone_views
-from advtex_engine.views import build_view_maps
+from advtex_engine.metrics.evaluate import PATCH_METRICS, VIEW_METRICS, Comparison, evaluate, score
+from advtex_engine.metrics.lpips import Lpips, WeightsError, load_lpips
+from advtex_engine.refine.run import apply_refinement, refine_cameras
+from advtex_engine.render.pictures import contact_sheet
+from advtex_engine.render.render_view import render_layers, render_view
+from advtex_engine.render.texture import fill_holes
+from advtex_engine.render.view_maps import build_view_maps
+from advtex_engine.results.export import export_model
+from advtex_engine.results.live import Live
+from advtex_engine.runtime.checkpoint import WorkFolder
+from advtex_engine.runtime.files import write_atomically
+from advtex_engine.selection.toning import tone_views
+from advtex_engine.synthetic.scan import SUPERSAMPLE, TRUTH
 
 RESULTS = Path(__file__).parent / "results"
 SHOWN_VIEW = 4  # of the held-out ones
@@ -110,7 +110,7 @@ def prepare(scan: Path, config: TextureConfig, work: Path, device: torch.device,
     atlas = build_atlas(scene.mesh, [view.camera for view in scene.views], config, monitor)
     atlas = dataclasses.replace(atlas, mesh=moved(atlas.mesh, device))
     maps = build_view_maps(atlas, scene.views, scene.kind)
-    preset = resolve_preset(config, device)
+    preset = resolve_preset(config, device.type)
     folder = WorkFolder(work, "", monitor)
     live = Live(scene, atlas, monitor)
     return MethodInput(scene, atlas, {1: maps}, {1: mean_texture(maps)}, preset, config, monitor, folder, live)

@@ -40,11 +40,11 @@ from harness import (
 )
 from study import make_scan
 
-from advtex_engine.config import PRESETS, TextureConfig
+from advtex_engine.core.config import PRESETS, TextureConfig, resolve_preset
 from advtex_engine.methods import MethodInput
-from advtex_engine.perceptual import Lpips
-from advtex_engine.pipeline import choose_device, resolve_preset
-from advtex_engine.speckle import speckle_share
+from advtex_engine.metrics.lpips import Lpips
+from advtex_engine.metrics.speckle import speckle_share
+from advtex_engine.runtime.devices import choose_device
 
 SIZE, VIEWS, FACES, TURN = "256x192", 60, 20_000, 5.0
 """Of the study's scans; the turn in degrees is the paper's e_a."""
@@ -201,7 +201,7 @@ def _run(
     if key not in inputs:
         inputs.clear()
         inputs[key] = prepare(scan, config, work, device)
-    preset = dataclasses.replace(resolve_preset(config, device), **row.preset)
+    preset = dataclasses.replace(resolve_preset(config, device.type), **row.preset)
     given = dataclasses.replace(inputs[key], config=config, preset=preset)
     watch = Stopwatch()
     texture = run_method(given, row.method)

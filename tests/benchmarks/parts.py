@@ -2,7 +2,7 @@
 
     python tests/benchmarks/parts.py [SCAN …] [--models 2] [--steps 1000]
 
-On synthetic scans with known truth, `default` with the errors that real ones have (`advtex_engine.synthesize`) and
+On synthetic scans with known truth, `default` with the errors that real ones have (`advtex_engine.synthetic.scan`) and
 `geometry` with larger ones of the mesh alone, and on scans of one's own against every 8th frame, held out. Writes
 parts.json (one cell per scan and variant), parts.md, and per synthetic scan a picture: a photograph from a held-out
 place beside the mean, view selection and the whole; per real scan and variant the model and a contact sheet. Stopped
@@ -43,10 +43,10 @@ from harness import (
 from study import SCANS, make_named_scan
 from torch import Tensor
 
-from advtex_engine.config import TextureConfig
+from advtex_engine.core.config import TextureConfig, resolve_preset
 from advtex_engine.methods import MethodInput
-from advtex_engine.perceptual import Lpips
-from advtex_engine.pipeline import choose_device, resolve_preset
+from advtex_engine.metrics.lpips import Lpips
+from advtex_engine.runtime.devices import choose_device
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,7 +145,7 @@ def textures(
         changed = dataclasses.replace(config, method=variant.method, refine=variant.refine)
         if variant.refine not in inputs:
             inputs[variant.refine] = prepare(scan, changed, work, device)
-        preset = dataclasses.replace(resolve_preset(changed, device), **variant.changes)
+        preset = dataclasses.replace(resolve_preset(changed, device.type), **variant.changes)
         given = dataclasses.replace(inputs[variant.refine], config=changed, preset=preset)
         watch = Stopwatch()
         texture = run_method(given, variant.method)

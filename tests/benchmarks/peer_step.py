@@ -30,15 +30,16 @@ import cv2
 import numpy as np
 import torch
 
-from advtex_engine.bench import full_optimizer, step_times
-from advtex_engine.bench_scene import made_scene
-from advtex_engine.config import PRESETS
-from advtex_engine.devices import choose_device
-from advtex_engine.graphed import Stepper
+from advtex_engine.adversarial.cuda_graph import Stepper
+from advtex_engine.bench.run import full_optimizer, step_times
+from advtex_engine.bench.scene import made_scene
+from advtex_engine.core.config import PRESETS
+from advtex_engine.core.scene import Atlas, Mesh, Scene
 from advtex_engine.methods.mean import mean_texture
-from advtex_engine.scene import Atlas, Mesh, Scene
-from advtex_engine.texture import decode_uv
-from advtex_engine.views import Pairs, ViewMaps, build_view_maps, related_pairs
+from advtex_engine.render.pairs import Pairs, related_pairs
+from advtex_engine.render.texture import decode_uv
+from advtex_engine.render.view_maps import ViewMaps, build_view_maps
+from advtex_engine.runtime.devices import choose_device
 
 PACKAGE = "advtex_init_align"
 NEEDED = tuple(

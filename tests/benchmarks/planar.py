@@ -24,14 +24,14 @@ import torch
 from harness import RESULTS, Results, Stopwatch, markdown_table, write_report
 from torch import Tensor
 
-from advtex_engine.config import PRINTED
-from advtex_engine.discriminator import PatchDiscriminator
-from advtex_engine.examples import InputForm
-from advtex_engine.metrics import nearest_patch_loss, sliced_wasserstein
-from advtex_engine.optimize import AdversarialOptimizer
+from advtex_engine.adversarial.discriminator import PatchDiscriminator
+from advtex_engine.adversarial.examples import InputForm
+from advtex_engine.adversarial.optimizer import AdversarialOptimizer
+from advtex_engine.core.config import PRINTED
+from advtex_engine.metrics.image_metrics import nearest_patch_loss, sliced_wasserstein
 from advtex_engine.pipeline import choose_device
-from advtex_engine.planar import planar_maps, planar_pairs, shifted_views
-from advtex_engine.synthetic_print import tin_side
+from advtex_engine.synthetic.planar import planar_maps, planar_pairs, shifted_views
+from advtex_engine.synthetic.print import tin_side
 
 SIZE, SHIFT, VIEWS = 128, 8, 60
 QUERIES = 4000

@@ -27,9 +27,9 @@ import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from advtex_engine.cameras import camera_center, pixel_centers, unproject
-from advtex_engine.rasterize import rasterize
-from advtex_engine.scene import Camera, Mesh
+from advtex_engine.core.cameras import camera_center, pixel_centers, unproject
+from advtex_engine.core.scene import Camera, Mesh
+from advtex_engine.render.rasterize import rasterize
 
 WIDTH, HEIGHT, FACES = 640, 480, 80_000
 DATA = Path(os.environ.get("ADVTEX_DATA", Path(__file__).parents[3] / "shared" / "data"))

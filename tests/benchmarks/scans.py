@@ -30,7 +30,7 @@ from harness import (
     write_report,
 )
 
-from advtex_engine.config import METHODS, TextureConfig
+from advtex_engine.core.config import METHODS, TextureConfig
 from advtex_engine.methods import MethodInput, require
 from advtex_engine.pipeline import choose_device
 

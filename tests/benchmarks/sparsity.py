@@ -42,9 +42,9 @@ from harness import (
 from study import SCANS, make_named_scan
 from torch import Tensor
 
-from advtex_engine.config import METHODS
-from advtex_engine.perceptual import Lpips
-from advtex_engine.pipeline import choose_device, resolve_preset
+from advtex_engine.core.config import METHODS, resolve_preset
+from advtex_engine.metrics.lpips import Lpips
+from advtex_engine.runtime.devices import choose_device
 
 VIRTUAL, PERTURBATION = "adversarial_virtual", 0.01
 SHOWN = ("l1", "view_selection", "adversarial", VIRTUAL)
@@ -88,7 +88,9 @@ def fill(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
             if (cell["every"], made) != used:
                 used, shown = (cell["every"], made), dict[str, Tensor]()
                 prepared = prepare(scan, config, Path(folder) / "work", device, cell["every"])
-            preset = dataclasses.replace(resolve_preset(config, device), perturbation=PERTURBATION if virtual else 0.0)
+            preset = dataclasses.replace(
+                resolve_preset(config, device.type), perturbation=PERTURBATION if virtual else 0.0
+            )
             given = dataclasses.replace(prepared, config=config, preset=preset)
             watch = Stopwatch()
             texture = run_method(given, config.method)

@@ -43,11 +43,11 @@ from harness import (
     write_report,
 )
 
-from advtex_engine.config import METHODS
+from advtex_engine.core.config import METHODS, resolve_preset
 from advtex_engine.methods import MethodInput, require
-from advtex_engine.perceptual import Lpips, WeightsError
-from advtex_engine.pipeline import choose_device, resolve_preset
-from advtex_engine.synthesize import synthesize
+from advtex_engine.metrics.lpips import Lpips, WeightsError
+from advtex_engine.runtime.devices import choose_device
+from advtex_engine.synthetic.scan import synthesize
 
 OBJECT_SIZE = 0.3
 """Metres, of the synthetic object: the unit of the paper's errors."""
@@ -137,7 +137,7 @@ class _Scans:
         if self.refined != cell["refined"]:
             self.prepared = prepare(self.folder / "scan", config, self.folder / "work", self.device)
             self.refined = cell["refined"]
-        preset = resolve_preset(config, self.device)
+        preset = resolve_preset(config, self.device.type)
         return dataclasses.replace(self.prepared, config=config, preset=preset), self.truth
 
 

@@ -19,9 +19,9 @@ import sparsity
 import study
 import torch
 
-from advtex_engine.discriminator import PatchDiscriminator
-from advtex_engine.perceptual import NETWORKS
-from advtex_engine.synthesize import synthesize
+from advtex_engine.adversarial.discriminator import PatchDiscriminator
+from advtex_engine.metrics.lpips import NETWORKS
+from advtex_engine.synthetic.scan import synthesize
 
 SMALL = ["--views", "6", "--size", "64x64", "--steps", "2", "--faces", "600", "--device", "cpu"]
 

@@ -6,8 +6,8 @@ import fusion
 import pytest
 import torch
 
-from advtex_engine.fusion import fuse
-from advtex_engine.monitor import Monitor
+from advtex_engine.core.monitor import Monitor
+from advtex_engine.mesh.fusion import fuse
 
 
 @pytest.mark.slow

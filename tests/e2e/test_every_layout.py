@@ -13,7 +13,8 @@ from live_service import LiveService
 from advtex_client import Client
 from advtex_contract.jobs import JobState, JobView
 from advtex_contract.options import JobOptions, Preset
-from advtex_engine import fusion, pipeline
+from advtex_engine import pipeline
+from advtex_engine.mesh import fusion
 from advtex_scan import check_scan
 from advtex_store.keys import scan_key
 from advtex_worker.adapt import texture_config

@@ -15,13 +15,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from advtex_engine.checkpoint import WorkFolder
-from advtex_engine.config import PRESETS, TextureConfig
-from advtex_engine.errors import OptionError, Problem, ScanError, Stopped
-from advtex_engine.monitor import STAGES, Glimpse, Monitor
-from advtex_engine.pipeline import choose_device, resolve_preset, texture_scan
-from advtex_engine.report import Stages, WarningKeeper
-from advtex_engine.synthesize import synthesize
+from advtex_engine.core.config import PRESETS, TextureConfig, resolve_preset
+from advtex_engine.core.errors import OptionError, Problem, ScanError, Stopped
+from advtex_engine.core.monitor import STAGES, Glimpse, Monitor, WarningKeeper
+from advtex_engine.pipeline import texture_scan
+from advtex_engine.runtime.checkpoint import WorkFolder
+from advtex_engine.runtime.devices import choose_device
+from advtex_engine.runtime.stage_records import Stages
+from advtex_engine.synthetic.scan import synthesize
 
 STEPS = 24
 CPU = torch.device("cpu")
@@ -317,12 +318,12 @@ def test_the_mean_method_takes_no_steps(scan: Path, tmp_path: Path) -> None:
 
 
 def test_auto_is_standard_on_a_cpu_and_full_on_a_gpu() -> None:
-    assert resolve_preset(TextureConfig(), torch.device("cpu")) == PRESETS["standard"]
-    assert resolve_preset(TextureConfig(), torch.device("cuda")) == PRESETS["full"]
+    assert resolve_preset(TextureConfig(), "cpu") == PRESETS["standard"]
+    assert resolve_preset(TextureConfig(), "cuda") == PRESETS["full"]
 
 
 def test_a_shorter_run_is_the_same_in_proportion() -> None:
-    shorter = resolve_preset(TextureConfig(preset="preview", steps=550), torch.device("cpu"))
+    shorter = resolve_preset(TextureConfig(preset="preview", steps=550), "cpu")
     whole = PRESETS["preview"]
     assert whole.steps == 1_100
     assert [level.steps for level in shorter.levels] == [400, 150]

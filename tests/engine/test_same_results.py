@@ -10,15 +10,16 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from advtex_engine import optimize, pipeline
-from advtex_engine.config import PRESETS, PRINTED, Preset, TextureConfig
-from advtex_engine.discriminator import PatchDiscriminator
-from advtex_engine.examples import InputForm
-from advtex_engine.metrics import gradient_ratio, psnr, ssim
-from advtex_engine.operations import plain_operations
-from advtex_engine.optimize import AdversarialOptimizer
-from advtex_engine.planar import planar_maps, planar_pairs, shifted_views
-from advtex_engine.synthesize import synthesize
+from advtex_engine import pipeline
+from advtex_engine.adversarial import optimizer as optimize
+from advtex_engine.adversarial.discriminator import PatchDiscriminator
+from advtex_engine.adversarial.examples import InputForm
+from advtex_engine.adversarial.operations import plain_operations
+from advtex_engine.adversarial.optimizer import AdversarialOptimizer
+from advtex_engine.core.config import PRESETS, PRINTED, Preset, TextureConfig
+from advtex_engine.metrics.image_metrics import gradient_ratio, psnr, ssim
+from advtex_engine.synthetic.planar import planar_maps, planar_pairs, shifted_views
+from advtex_engine.synthetic.scan import synthesize
 
 SIZE, SHIFT = 64, 2
 CPU = torch.device("cpu")

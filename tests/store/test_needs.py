@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from advtex_contract.options import JobOptions, Preset
-from advtex_engine.capture import MAX_HELDOUT, MAX_MAP_BYTES
-from advtex_engine.config import TextureConfig
-from advtex_engine.fusion import MAX_VOXEL_BYTES
+from advtex_engine.core.config import TextureConfig
+from advtex_engine.ingest.frames import MAX_HELDOUT, MAX_MAP_BYTES
+from advtex_engine.mesh.fusion import MAX_VOXEL_BYTES
 from advtex_store.needs import (
     BASE,
     GIB,

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 import trimesh
 
-from advtex_engine.atlas import SIZE_STEP, texel_coverage
-from advtex_engine.scene import Atlas, Camera, Mesh
+from advtex_engine.atlas.build import SIZE_STEP, texel_coverage
+from advtex_engine.core.scene import Atlas, Camera, Mesh
 
 
 def camera(eye: tuple[float, float, float], width: int = 320, height: int = 240, focal: float = 300.0) -> Camera:

@@ -16,9 +16,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from advtex_engine.config import TextureConfig
-from advtex_engine.errors import OptionError, Problem, ScanError, Stopped
-from advtex_engine.monitor import Glimpse, Monitor
+from advtex_engine.core.config import TextureConfig
+from advtex_engine.core.errors import OptionError, Problem, ScanError, Stopped
+from advtex_engine.core.monitor import Glimpse, Monitor
 
 RESULTS = ("model.obj", "model.mtl", "model.png", "model.glb", "report.json", "previews/side_by_side.png")
 
@@ -39,7 +39,8 @@ def quick(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: b
 
 def coarse(scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool, monitor: Monitor) -> None:
     """The real engine; but what it fuses from depth has voxels of 8 cm, and not of 1 cm."""
-    from advtex_engine import fusion, pipeline
+    from advtex_engine import pipeline
+    from advtex_engine.mesh import fusion
 
     fusion.COARSEST = fusion.FINEST = 0.08
     pipeline.texture_scan(scan, out, config, work=work, resume=resume, monitor=monitor)

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import fake_engines
 
-from advtex_engine.config import TextureConfig
-from advtex_engine.monitor import Glimpse, Monitor
+from advtex_engine.core.config import TextureConfig
+from advtex_engine.core.monitor import Glimpse, Monitor
 
 FAILS = 1  # the seed
 CURVES = {"steps": [1, 2, 3], "series": {"l1": [0.3, 0.2, 0.1]}, "quality": {"steps": [], "series": {}}}

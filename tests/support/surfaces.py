@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from advtex_engine.scene import Mesh
+from advtex_engine.core.scene import Mesh
 
 NEAREST = 8  # faces by centroid, of which the nearest is taken: enough where faces are of one size
 CHUNK = 64

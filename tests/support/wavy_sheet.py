@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from advtex_engine.scene import Camera, Mesh
+from advtex_engine.core.scene import Camera, Mesh
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
 

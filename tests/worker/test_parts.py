@@ -20,8 +20,8 @@ from hypothesis import strategies as st
 
 from advtex_contract.jobs import Progress
 from advtex_contract.options import JobOptions, Method, Preset
-from advtex_engine import config as engine
-from advtex_engine.monitor import STAGES
+from advtex_engine.core import config as engine
+from advtex_engine.core.monitor import STAGES
 from advtex_store.errors import StaleAttempt
 from advtex_store.queue import TASK
 from advtex_store.records import Lease

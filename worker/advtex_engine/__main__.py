@@ -11,10 +11,10 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from advtex_engine.bench_options import add_bench_options
-from advtex_engine.config import METHODS, PRESETS, TextureConfig
-from advtex_engine.errors import EngineError, OptionError, Problem, Stopped
-from advtex_engine.monitor import Monitor
+from advtex_engine.bench.options import add_bench_options
+from advtex_engine.core.config import METHODS, PRESETS, TextureConfig
+from advtex_engine.core.errors import EngineError, OptionError, Problem, Stopped
+from advtex_engine.core.monitor import Monitor
 from advtex_scan.layouts import LAYOUT_NAMES
 
 
@@ -161,7 +161,7 @@ def _texture(arguments: argparse.Namespace) -> int:
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    from advtex_engine.deep_check import deep_check
+    from advtex_engine.conventions.check import deep_check
 
     check = deep_check(arguments.scan, arguments.layout)
     if arguments.json:
@@ -172,8 +172,8 @@ def _check(arguments: argparse.Namespace) -> int:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
-    from advtex_engine.evaluate import evaluate, write_json
-    from advtex_engine.perceptual import LPIPS_SOURCES, download, weights_folder
+    from advtex_engine.metrics.evaluate import evaluate, write_json
+    from advtex_engine.metrics.lpips import LPIPS_SOURCES, download, weights_folder
 
     if arguments.download_weights:
         download(LPIPS_SOURCES, weights_folder(arguments.lpips_weights))
@@ -200,7 +200,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
 
 def _synthesize(arguments: argparse.Namespace) -> int:
-    from advtex_engine.synthesize import synthesize
+    from advtex_engine.synthetic.scan import synthesize
 
     width, height = arguments.size
     synthesize(arguments.out, views=arguments.views, width=width, height=height, seed=arguments.seed)
@@ -209,14 +209,14 @@ def _synthesize(arguments: argparse.Namespace) -> int:
 
 
 def _compare(arguments: argparse.Namespace) -> int:
-    from advtex_engine.synthesize import compare_to_truth
+    from advtex_engine.synthetic.scan import compare_to_truth
 
     print(json.dumps(compare_to_truth(arguments.model, arguments.scan)))
     return 0
 
 
 def _bench(arguments: argparse.Namespace) -> int:
-    from advtex_engine.bench import run
+    from advtex_engine.bench.run import run
 
     return run(arguments)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from advtex_contract.options import JobOptions
-from advtex_engine.config import TextureConfig
+from advtex_engine.core.config import TextureConfig
 
 
 def texture_config(options: JobOptions, device: str, memory_bytes: int | None = None) -> TextureConfig:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 
 from advtex_contract.jobs import Progress
-from advtex_engine.monitor import STAGES
+from advtex_engine.core.monitor import STAGES
 from advtex_worker.events import NoteEvent, ProgressEvent, StageEvent
 
 NOTES, NOTE_LENGTH = 50, 500

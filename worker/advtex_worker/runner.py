@@ -24,8 +24,8 @@ from pydantic import ValidationError
 
 from advtex_contract.errors import ErrorDetail
 from advtex_contract.live import LiveRecord
-from advtex_engine.errors import EngineError, MemoryShortage, OptionError, Problem, ScanError, Stopped
-from advtex_engine.monitor import Glimpse, Monitor
+from advtex_engine.core.errors import EngineError, MemoryShortage, OptionError, Problem, ScanError, Stopped
+from advtex_engine.core.monitor import Glimpse, Monitor
 from advtex_worker.adapt import texture_config
 from advtex_worker.events import (
     CANCEL_LINE,

@@ -11,17 +11,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advtex_engine.checkpoint import Checkpoints
-from advtex_engine.config import Preset
-from advtex_engine.disagreement import disagreement
-from advtex_engine.discriminator import PatchDiscriminator
-from advtex_engine.errors import Diverged, Problem, Stopped
-from advtex_engine.graphed import Stepper
+from advtex_engine.adversarial.cuda_graph import Stepper
+from advtex_engine.adversarial.disagreement import disagreement
+from advtex_engine.adversarial.discriminator import PatchDiscriminator
+from advtex_engine.adversarial.optimizer import AdversarialOptimizer
+from advtex_engine.core.config import Preset
+from advtex_engine.core.errors import Diverged, Problem, Stopped
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.methods.mean import dense_texture
-from advtex_engine.optimize import AdversarialOptimizer
-from advtex_engine.streaming import PairViews, pair_views
-from advtex_engine.views import Pairs, ViewMaps, own_pairs, related_pairs
+from advtex_engine.render.pairs import Pairs, own_pairs, related_pairs
+from advtex_engine.render.streaming import PairViews, pair_views
+from advtex_engine.render.view_maps import ViewMaps
+from advtex_engine.runtime.checkpoint import Checkpoints
 
 NEEDED = ("level", "step", "losses", "quality", "halved", "optimizer", "views")
 """What a checkpoint holds."""

@@ -10,12 +10,12 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from advtex_engine.core.scene import Atlas
 from advtex_engine.methods.inputs import LossPoint, MethodInput
-from advtex_engine.reproject import reproject
-from advtex_engine.scene import Atlas
-from advtex_engine.texels import TexelMap, map_texels, surface_points
-from advtex_engine.texture import decode_uv, fill_holes
-from advtex_engine.views import DEPTH_TOLERANCE, ViewMaps
+from advtex_engine.render.reproject import reproject
+from advtex_engine.render.texels import TexelMap, map_texels, surface_points
+from advtex_engine.render.texture import decode_uv, fill_holes
+from advtex_engine.render.view_maps import DEPTH_TOLERANCE, ViewMaps
 
 MIN_SEEN = 0.5
 """Share of a face's projected area that a view must see: a face that is mostly hidden is painted by another view."""

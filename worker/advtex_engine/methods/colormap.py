@@ -6,9 +6,9 @@ from torch import Tensor
 
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.methods.mean import mean_texture
-from advtex_engine.refine_warp import warp_views
-from advtex_engine.streaming import host_allocator
-from advtex_engine.views import build_view_maps
+from advtex_engine.refine.warp import warp_views
+from advtex_engine.render.streaming import host_allocator
+from advtex_engine.render.view_maps import build_view_maps
 
 
 def colormap(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:

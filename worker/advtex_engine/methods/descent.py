@@ -8,11 +8,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from advtex_engine.checkpoint import Checkpoints, restore_generator
-from advtex_engine.errors import Diverged, Stopped
+from advtex_engine.core.errors import Diverged, Stopped
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.methods.mean import dense_texture
-from advtex_engine.streaming import PairViews
+from advtex_engine.render.streaming import PairViews
+from advtex_engine.runtime.checkpoint import Checkpoints, restore_generator
 
 LR = 1e-3
 """Learning rate of the first step, in colors of [0, 1]; it falls to zero in a straight line, so that the last steps

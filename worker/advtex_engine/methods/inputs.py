@@ -8,12 +8,12 @@ from typing import Any
 
 from torch import Tensor
 
-from advtex_engine.checkpoint import WorkFolder
-from advtex_engine.config import Preset, TextureConfig
-from advtex_engine.live import Live
-from advtex_engine.monitor import Monitor
-from advtex_engine.scene import Atlas, Scene
-from advtex_engine.views import ViewMaps
+from advtex_engine.core.config import Preset, TextureConfig
+from advtex_engine.core.monitor import Monitor
+from advtex_engine.core.scene import Atlas, Scene
+from advtex_engine.render.view_maps import ViewMaps, held_bytes
+from advtex_engine.results.live import Live
+from advtex_engine.runtime.checkpoint import WorkFolder
 
 LossPoint = dict[str, Any]
 
@@ -42,3 +42,9 @@ class MethodInput:
     start: Tensor | None = None
     on_device: int | None = None
     facts: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def held_bytes(self) -> int:
+        """Bytes of the tensors that the device holds for the method before it begins."""
+        held = held_bytes(self.maps.values(), self.maps[1].device) + sum(mean.nbytes for mean in self.means.values())
+        return held + (0 if self.start is None else self.start.nbytes)

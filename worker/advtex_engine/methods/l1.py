@@ -12,8 +12,8 @@ from torch import Tensor
 
 from advtex_engine.methods.descent import descend
 from advtex_engine.methods.inputs import LossPoint, MethodInput
-from advtex_engine.texture import bilinear_footprint, decode_uv, sample_texels
-from advtex_engine.views import ViewMaps, foregrounds
+from advtex_engine.render.texture import bilinear_footprint, decode_uv, sample_texels
+from advtex_engine.render.view_maps import ViewMaps, foregrounds
 
 PASSES = 20  # over all views, unless the number of steps is asked for
 

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from advtex_engine.methods.inputs import LossPoint, MethodInput
-from advtex_engine.texture import bilinear_footprint, decode_uv, fill_holes
-from advtex_engine.views import ViewMaps
+from advtex_engine.render.texture import bilinear_footprint, decode_uv, fill_holes
+from advtex_engine.render.view_maps import ViewMaps
 
 
 def mean(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from advtex_engine.methods.best_view import one_view_texture
 from advtex_engine.methods.inputs import LossPoint, MethodInput
-from advtex_engine.metrics import gradient_magnitude, luminance
-from advtex_engine.views import ViewMaps
+from advtex_engine.metrics.image_metrics import gradient_magnitude, luminance
+from advtex_engine.render.view_maps import ViewMaps
 
 BLUR = 9
 """Pixels; side of the box that a photograph is blurred with, as in Crete et al."""

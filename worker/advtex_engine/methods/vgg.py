@@ -14,13 +14,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from advtex_engine.batches import PairSampler
+from advtex_engine.adversarial.pair_sampler import PairSampler
 from advtex_engine.methods.descent import descend
 from advtex_engine.methods.inputs import LossPoint, MethodInput
-from advtex_engine.perceptual import FeatureStack, load_features
-from advtex_engine.streaming import pair_views
-from advtex_engine.texture import sample_texels
-from advtex_engine.views import related_pairs
+from advtex_engine.metrics.lpips import FeatureStack, load_features
+from advtex_engine.render.pairs import related_pairs
+from advtex_engine.render.streaming import pair_views
+from advtex_engine.render.texture import sample_texels
 
 WEIGHTS_VARIABLE = "ADVTEX_VGG_WEIGHTS"
 LAYERS = 7
@@ -44,13 +44,13 @@ def vgg(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     sampler = PairSampler(views.maps, views.pairs, kind, (min(CROP, maps.width), min(CROP, maps.height)), generator)
 
     def distance(values: Tensor, _step: int) -> Tensor:
-        batch = sampler.draw()
-        render = sampler.image(sample_texels(values, batch.slots, batch.weights))
+        pair = sampler.draw()
+        render = sampler.image(sample_texels(values, pair.slots, pair.weights))
         # What the auxiliary view does not see is the same in both: the source.
-        around = (batch.condition + 1) / 2
-        fake = torch.where(batch.visible > 0, render, around)
+        around = (pair.condition + 1) / 2
+        fake = torch.where(pair.visible > 0, render, around)
         with torch.no_grad():
-            wanted = features(torch.where(batch.visible > 0, (batch.real + 1) / 2, around))
+            wanted = features(torch.where(pair.visible > 0, (pair.real + 1) / 2, around))
         return torch.stack([(a - b).abs().mean() for a, b in zip(features(fake), wanted, strict=True)]).sum()
 
     return descend(given, "vgg", distance, preset.steps, generator, views)

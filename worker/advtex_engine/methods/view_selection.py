@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from advtex_engine.assignment import assign_views
-from advtex_engine.back_projection import back_project
-from advtex_engine.candidates import OCCLUSION_SHARE, find_candidates
-from advtex_engine.leveling import Sampler, blend_texels
 from advtex_engine.methods.inputs import LossPoint, MethodInput
-from advtex_engine.texels import map_texels
-from advtex_engine.texture import fill_holes
-from advtex_engine.views import DEPTH_TOLERANCE
+from advtex_engine.render.texels import map_texels
+from advtex_engine.render.texture import fill_holes
+from advtex_engine.render.view_maps import DEPTH_TOLERANCE
+from advtex_engine.selection.back_projection import back_project
+from advtex_engine.selection.candidates import OCCLUSION_SHARE, find_candidates
+from advtex_engine.selection.leveling import Sampler, blend_texels
+from advtex_engine.selection.mrf import assign_views
 
 
 @dataclass(frozen=True)

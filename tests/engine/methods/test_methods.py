@@ -1,0 +1,352 @@
+"""Each method on small scenes whose right answer is known: which view a face gets, what color a texel takes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from advtex_engine.adversarial.disagreement import disagreement
+from advtex_engine.adversarial.discriminator import PatchDiscriminator
+from advtex_engine.adversarial.optimizer import AdversarialOptimizer
+from advtex_engine.core.config import METHODS as METHOD_NAMES
+from advtex_engine.core.config import PRINTED, PyramidLevel, TextureConfig
+from advtex_engine.core.errors import Stopped
+from advtex_engine.core.monitor import Monitor
+from advtex_engine.core.scene import Atlas, Camera, Mesh, Scene, View
+from advtex_engine.methods import METHODS, MethodInput, descent
+from advtex_engine.methods.best_view import label_faces
+from advtex_engine.methods.mean import mean_texture
+from advtex_engine.methods.sharpest import sharpness
+from advtex_engine.methods.vgg import WEIGHTS_VARIABLE, load_vgg
+from advtex_engine.metrics.lpips import NETWORKS, WeightsError, load_features
+from advtex_engine.pipeline import texture_scan
+from advtex_engine.render.pairs import own_pairs
+from advtex_engine.render.rasterize import rasterize
+from advtex_engine.render.render_view import render_view
+from advtex_engine.render.texels import map_texels
+from advtex_engine.render.view_maps import build_view_maps
+from advtex_engine.results.live import Live
+from advtex_engine.runtime.checkpoint import WorkFolder
+from advtex_engine.synthetic.object import look_at
+from advtex_engine.synthetic.planar import planar_maps
+
+SIDE, CELLS = 96, 8  # texels of the plane's side, and its quads
+WIDTH, HEIGHT = 96, 80
+
+
+def quads(z: float, left: float, right: float, cells: int) -> tuple[Tensor, Tensor]:
+    """A square grid of cells x cells quads in the plane of height z: positions and faces."""
+    x, y = torch.meshgrid(torch.linspace(left, right, cells + 1), torch.linspace(0, 1, cells + 1), indexing="xy")
+    position = torch.stack((x, y, torch.full_like(x, z)), 2).view(-1, 3)
+    corner = (torch.arange(cells)[:, None] * (cells + 1) + torch.arange(cells)).flatten()
+    a, b, c, d = corner, corner + 1, corner + cells + 2, corner + cells + 1
+    return position, torch.cat((torch.stack((a, b, c), 1), torch.stack((a, c, d), 1)))
+
+
+def plane() -> Atlas:
+    """The unit square at height 0, its texture as it lies: u along x, v along y."""
+    position, faces = quads(0.0, 0.0, 1.0, CELLS)
+    return Atlas(Mesh(position, faces, position[:, :2].clone(), faces), SIDE, SIDE, "scan", 1)
+
+
+def truth() -> Tensor:
+    """Smooth noise [SIDE,SIDE,3], so that bilinear interpolation is nearly exact."""
+    noise = torch.rand((1, 3, 9, 9), generator=torch.Generator().manual_seed(1))
+    return F.interpolate(noise, (SIDE, SIDE), mode="bicubic", align_corners=True).clamp(0, 1)[0].permute(1, 2, 0)
+
+
+def camera(eye: tuple[float, float, float], target: tuple[float, float, float] = (0.5, 0.5, 0.0)) -> Camera:
+    pose = torch.from_numpy(look_at(np.array(eye), np.array(target)))
+    K = torch.tensor([[90.0, 0, WIDTH / 2], [0, 90.0, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64)
+    return Camera(K, pose, WIDTH, HEIGHT)
+
+
+def view(name: str, atlas: Atlas, texture: Tensor, place: Camera) -> View:
+    image = render_view(atlas, texture, place, supersample=1)
+    return View(name, place, (image * 255).round().clamp(0, 255).to(torch.uint8))
+
+
+def task(
+    atlas: Atlas, views: tuple[View, ...], work: Path, *, monitor: Monitor | None = None, **config: object
+) -> MethodInput:
+    maps = build_view_maps(atlas, views, "scene")
+    listener = monitor or Monitor()
+    preset = replace(PRINTED, levels=(PyramidLevel(3),), start="mean")
+    scene = Scene(atlas.mesh, views)
+    return MethodInput(
+        scene,
+        atlas,
+        {1: maps},
+        {1: mean_texture(maps)},
+        preset,
+        TextureConfig(**config),  # type: ignore[arg-type]  # keywords of one test each
+        listener,
+        WorkFolder(work, "", listener),
+        Live(scene, atlas, listener),
+    )
+
+
+@pytest.fixture
+def around(tmp_path: Path) -> MethodInput:
+    """The plane, seen without any error from five places."""
+    atlas, texture = plane(), truth()
+    eyes = [(0.5, 0.45, 1.0), (0.1, 0.5, 1.1), (0.9, 0.5, 1.2), (0.5, 0.0, 1.3), (0.45, 0.9, 1.1)]
+    views = tuple(view(str(number), atlas, texture, camera(eye)) for number, eye in enumerate(eyes))
+    return task(atlas, views, tmp_path)
+
+
+def test_the_table_of_methods_is_that_of_the_configuration() -> None:
+    assert tuple(METHODS) == METHOD_NAMES
+
+
+@pytest.mark.parametrize("name", ["mean", "l1", "best_view", "sharpest"])
+def test_without_errors_every_method_finds_the_texture(name: str, around: MethodInput) -> None:
+    texture, _ = METHODS[name](around)
+    assert texture.shape == (SIDE, SIDE, 3)
+    seen = around.maps[1].slot_map >= 0
+    assert (texture - truth())[seen].abs().mean() < 0.01
+    assert (texture - truth())[seen].abs().quantile(0.99) < 0.05
+
+
+def test_a_face_goes_to_the_view_that_shows_it_on_most_pixels(around: MethodInput) -> None:
+    """Against pixels counted in a rendering of face indices."""
+    atlas, maps = around.atlas, around.maps[1]
+    labels = label_faces(maps, atlas, map_texels(atlas), lambda _view, area: area)
+    faces = len(atlas.mesh.t_pos_idx)
+    counts = []
+    for each in around.scene.views:
+        index = rasterize(atlas.mesh, each.camera).face_index
+        counts.append(torch.bincount(index[index >= 0].long(), minlength=faces))
+    ordered, best = torch.stack(counts).sort(0, descending=True)
+    clear = ordered[0] > 1.25 * ordered[1]
+    assert clear.sum() > 20
+    assert torch.equal(labels[clear], best[0][clear])
+    assert len(labels.unique()) > 1  # type: ignore[no-untyped-call]
+
+
+def test_a_hidden_face_goes_to_a_view_that_sees_it(tmp_path: Path) -> None:
+    """A board hangs over the left half: the nearer camera, above it, does not see what lies below."""
+    lower, lower_faces = quads(0.0, 0.0, 1.0, CELLS)
+    upper, upper_faces = quads(0.3, -0.2, 0.5, CELLS)
+    position = torch.cat((lower, upper))
+    faces = torch.cat((lower_faces, upper_faces + len(lower)))
+    uv = torch.cat((lower[:, :2] * 0.45 + 0.02, torch.stack((upper[:, 0] * 0.4 + 0.6, upper[:, 1] * 0.45), 1)))
+    atlas = Atlas(Mesh(position, faces, uv, faces), 2 * SIDE, 2 * SIDE, "scan", 2)
+    texture = torch.rand((2 * SIDE, 2 * SIDE, 3), generator=torch.Generator().manual_seed(0))
+    above, below = camera((0.5, 0.45, 1.0)), camera((1.6, 0.5, 0.25))
+    given = task(atlas, (view("above", atlas, texture, above), view("below", atlas, texture, below)), tmp_path)
+    labels = label_faces(given.maps[1], atlas, map_texels(atlas), lambda _view, area: area)
+    middle = position[faces].mean(1)
+    floor = torch.arange(len(faces)) < len(lower_faces)
+    central = (middle[:, 1] - 0.5).abs() < 0.3
+    hidden = floor & (middle[:, 0] > 0.1) & (middle[:, 0] < 0.35)
+    assert not (labels[hidden] == 0).any()
+    assert (labels[hidden] == 1).any()
+    assert (labels[floor & central & (middle[:, 0] > 0.6)] == 0).all()
+    assert (labels[~floor & central & (middle[:, 0] > 0.2)] == 0).all(), "the board itself is seen from above"
+
+
+def test_the_sharpest_photograph_wins_over_a_nearer_blurred_one(tmp_path: Path) -> None:
+    atlas = plane()
+    texture = torch.rand((SIDE, SIDE, 3), generator=torch.Generator().manual_seed(3))
+    near, far = (view(str(z), atlas, texture, camera((0.5, 0.45, z))) for z in (1.0, 1.15))
+    planes = near.color.permute(2, 0, 1)[None].float()
+    blurred = F.avg_pool2d(planes, 7, 1, 3, count_include_pad=False)[0].permute(1, 2, 0).round().to(torch.uint8)
+    given = task(atlas, (replace(near, color=blurred), far), tmp_path)
+    nearest, _ = METHODS["best_view"](given)
+    sharpest, _ = METHODS["sharpest"](given)
+
+    def contrast(image: Tensor) -> float:
+        return float(image[20:-20, 20:-20].std())
+
+    assert contrast(sharpest) > 2 * contrast(nearest)
+
+
+def test_sharpness_falls_with_blur_and_knows_no_exposure(around: MethodInput) -> None:
+    maps = around.maps[1]
+    image = maps.color[0].view(HEIGHT, WIDTH, 3).permute(2, 0, 1)[None].float()
+    noisy = (image + 40 * torch.randn(image.shape, generator=torch.Generator().manual_seed(0))).clamp(0, 255)
+    soft = F.avg_pool2d(noisy, 5, 1, 2, count_include_pad=False)
+    values = []
+    for picture in (noisy, noisy * 0.6, soft):
+        rows = picture[0].permute(1, 2, 0).round().to(torch.uint8).reshape(1, -1, 3)
+        values.append(sharpness(replace(maps, color=rows), 0))
+    assert values[1] == pytest.approx(values[0], abs=0.01)
+    assert 0 <= values[2] < 0.8 * values[0] < 1
+    flat = torch.full((1, HEIGHT * WIDTH, 3), 90, dtype=torch.uint8)
+    assert 0 <= sharpness(replace(maps, color=flat), 0) <= 1
+
+
+def flat_task(work: Path, monitor: Monitor | None = None, **config: object) -> tuple[MethodInput, Tensor]:
+    """Five photographs of the same 24x32 texels that agree in nothing, one texel per pixel."""
+    color = torch.randint(0, 256, (5, 24, 32, 3), generator=torch.Generator().manual_seed(2), dtype=torch.uint8)
+    maps = planar_maps(color, 32, 24)
+    given = task(plane(), (view("0", plane(), truth(), camera((0.5, 0.45, 1.0))),), work, monitor=monitor, **config)
+    return replace(given, maps={1: maps}, means={1: mean_texture(maps)}), color
+
+
+def test_l1_is_the_median_where_every_pixel_is_one_texel(tmp_path: Path) -> None:
+    given, color = flat_task(tmp_path, steps=3000)
+    texture, losses = METHODS["l1"](given)
+    median = color.float().median(0).values / 255
+    # The codes of texture coordinates are 1/65535 apart, so the pixels are not exactly the texels.
+    assert (texture - median).abs().mean() < 0.01
+    least = float((color.float() / 255 - median).abs().mean())
+    assert losses[-1]["l1"] == pytest.approx(least, rel=0.03)
+    assert losses[0]["l1"] > losses[-1]["l1"]
+
+
+def test_l1_sees_every_view_equally_often(tmp_path: Path) -> None:
+    """Without a number of steps it makes whole passes; a view without foreground is left out."""
+    given, _ = flat_task(tmp_path)
+    maps = given.maps[1]
+    depth = maps.depth.clone()
+    depth[3] = 0
+    _, losses = METHODS["l1"](replace(given, maps={1: replace(maps, depth=depth)}))
+    assert losses[-1]["step"] % 4 == 0
+    assert losses[-1]["step"] >= 40
+
+
+class Stopper(Monitor):
+    def __init__(self, at: int) -> None:
+        self.at, self.step = at, 0
+
+    def progress(self, step: int, steps: int, losses: Mapping[str, float]) -> None:
+        assert math.isfinite(losses["l1"])
+        self.step = step
+
+    def stop_requested(self) -> bool:
+        return self.step == self.at
+
+
+def test_a_descent_that_is_stopped_goes_on_to_the_same_texture(tmp_path: Path) -> None:
+    whole, losses = METHODS["l1"](flat_task(tmp_path / "whole", steps=30)[0])
+    with pytest.raises(Stopped, match="after step 11 of 30"):
+        METHODS["l1"](flat_task(tmp_path / "parts", Stopper(11), steps=30)[0])
+    resumed, later = METHODS["l1"](flat_task(tmp_path / "parts", steps=30)[0])
+    assert torch.equal(whole, resumed)
+    assert losses == later
+
+
+def test_a_stop_at_the_last_step_still_ends_the_run(tmp_path: Path) -> None:
+    texture, _ = METHODS["l1"](flat_task(tmp_path, Stopper(30), steps=30)[0])
+    assert texture.isfinite().all()
+
+
+def small_optimizer(around: MethodInput, **ablation: bool) -> AdversarialOptimizer:
+    maps = around.maps[1]
+    return AdversarialOptimizer(
+        maps,
+        own_pairs(maps),
+        around.means[1][maps.slot_map >= 0],
+        replace(PRINTED, **ablation),  # type: ignore[arg-type]  # flags of the ablations
+        kind="scene",
+        steps=4,
+        generator=torch.Generator().manual_seed(0),
+        discriminator=PatchDiscriminator(torch.Generator().manual_seed(0)),
+    )
+
+
+def test_without_auxiliary_views_the_real_example_is_the_source(around: MethodInput) -> None:
+    batch = small_optimizer(around).draw()
+    assert torch.equal(batch.visible, batch.foreground)
+    difference = ((batch.real - batch.condition) * batch.visible).abs()
+    assert difference.mean() < 0.01
+
+
+def test_without_the_condition_the_discriminator_does_not_see_the_source(around: MethodInput) -> None:
+    for condition in (True, False):
+        of = small_optimizer(around, condition=condition)
+        batch = of.draw()
+        losses = of.play(batch)
+        other = of.play(replace(batch, condition=batch.condition.flip(-1)))
+        assert torch.equal(losses.discriminator, other.discriminator) is not condition
+        assert losses.l1 == other.l1
+
+
+@pytest.mark.parametrize("name", ["adversarial", "adversarial_no_auxiliary", "adversarial_no_condition"])
+def test_the_ablations_run_and_differ(name: str, around: MethodInput) -> None:
+    texture, losses = METHODS[name](around)
+    assert texture.isfinite().all()
+    assert losses[-1]["step"] == 3
+    if name != "adversarial":
+        whole, _ = METHODS["adversarial"](replace(around, work=WorkFolder(around.work.path / "2", "", Monitor())))
+        assert not torch.equal(texture, whole)
+
+
+def test_a_rate_may_be_in_units_of_the_views_disagreement(around: MethodInput, tmp_path: Path) -> None:
+    units = {"color": 1.0, "disagreement": disagreement(around.maps[1], around.means[1]) ** 0.5}
+    assert 0 < units["disagreement"] < 0.5
+    for unit, size in units.items():
+        preset = replace(around.preset, start="mean", lr_texture=2e-3, lr_unit=unit)
+        given = replace(around, preset=preset, work=WorkFolder(tmp_path / unit, "", Monitor()))
+        METHODS["adversarial"](given)
+        assert given.facts["step"]["lr_texture"] == pytest.approx(2e-3 * size)
+
+
+def feature_weights() -> dict[str, Tensor]:
+    """VGG16's table with random weights of a sensible scale: features differ where images do, as with trained ones."""
+    generator = torch.Generator().manual_seed(0)
+    table = {}
+    for layer in NETWORKS["vgg16"]:
+        fan = layer.inputs * layer.kernel**2
+        shape = (layer.outputs, layer.inputs, layer.kernel, layer.kernel)
+        table[f"features.{layer.number}.weight"] = torch.randn(shape, generator=generator) * math.sqrt(2 / fan)
+        table[f"features.{layer.number}.bias"] = torch.zeros(layer.outputs)
+    return table
+
+
+@pytest.fixture
+def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "weights"
+    folder.mkdir()
+    torch.save(feature_weights(), folder / "vgg16-397923af.pth")
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(folder))
+    return folder
+
+
+@pytest.mark.usefixtures("weights")
+def test_vgg_comes_nearer_in_features_and_in_colors(around: MethodInput, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From a gray start, since without errors the mean is the answer already."""
+    monkeypatch.setattr(descent, "LR", 1e-2)
+    gray = torch.full_like(around.means[1], 0.5)
+    preset = replace(around.preset, levels=(PyramidLevel(15),))
+    texture, losses = METHODS["vgg"](replace(around, means={1: gray}, preset=preset))
+    assert losses[-1]["vgg"] < 0.9 * losses[0]["vgg"]
+    seen = around.maps[1].slot_map >= 0
+    before, after = ((start - truth())[seen].abs().mean() for start in (gray, texture))
+    assert after < 0.9 * before
+
+
+def test_the_truncated_network_gives_the_first_features_of_the_whole(weights: Path) -> None:
+    images = torch.rand((1, 3, 32, 32), generator=torch.Generator().manual_seed(0))
+    short, whole = load_vgg()(images), load_features("vgg16", weights)(images)
+    assert len(short) == 3
+    assert all(torch.equal(a, b) for a, b in zip(short, whole, strict=False))
+
+
+def test_vgg_without_weights_says_what_is_missing(
+    around: MethodInput, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path))
+    with pytest.raises(WeightsError, match=r"no weights: .* has no file vgg16-\*\.pth"):
+        METHODS["vgg"](around)
+    with pytest.raises(WeightsError, match="no weights"):
+        texture_scan(tmp_path, tmp_path / "out", TextureConfig(method="vgg"), work=tmp_path / "work")
+    assert not (tmp_path / "out").exists(), "it is said before anything is done"
+
+
+def test_colormap_always_refines_cameras() -> None:
+    assert TextureConfig(method="colormap", refine=False).refines
+    assert TextureConfig(method="colormap", preset="paper").refines
+    assert TextureConfig(method="mean").refines
+    assert not TextureConfig(method="mean", refine=False).refines
+    assert not TextureConfig(preset="paper").refines

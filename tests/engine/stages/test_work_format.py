@@ -1,0 +1,130 @@
+"""What the work folder's files hold, as of a number: another version's files are ignored and not stumbled over.
+
+The structure of every file (names, kinds, types and ranks of tensors) stands in work_format.json. Where a change of the
+engine changes it, FORMAT in `checkpoint.py` is raised, and the file renewed:
+
+    ADVTEX_RENEW=1 pytest tests/engine/stages/test_work_format.py
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from advtex_engine.core.config import TextureConfig
+from advtex_engine.core.errors import Stopped
+from advtex_engine.core.monitor import Monitor
+from advtex_engine.pipeline import texture_scan
+from advtex_engine.runtime import checkpoint
+from advtex_engine.synthetic.scan import synthesize
+
+KNOWN = Path(__file__).with_name("work_format.json")
+CONFIGS = {
+    method: TextureConfig(
+        preset="preview", method=method, steps=6, size=(96, 72), face_budget=800, max_texture_size=256, device="cpu"
+    )
+    for method in ("adversarial", "l1")
+}
+
+
+class StopsAtTwo(Monitor):
+    def __init__(self) -> None:
+        self.step, self.notes = 0, list[str]()
+
+    def progress(self, step: int, steps: int, losses: Mapping[str, float]) -> None:
+        self.step = step
+
+    def stop_requested(self) -> bool:
+        return self.step >= 2
+
+    def note(self, message: str) -> None:
+        self.notes.append(message)
+
+
+class Listens(StopsAtTwo):
+    def stop_requested(self) -> bool:
+        return False
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a scan and, per method, the work folder of a run that was stopped after its second step."""
+    folder = tmp_path_factory.mktemp("format")
+    synthesize(folder / "scan", views=8, width=96, height=72, seed=0)
+    for method, config in CONFIGS.items():
+        with pytest.raises(Stopped):
+            texture_scan(folder / "scan", folder / "out", config, work=folder / method, monitor=StopsAtTwo())
+    return folder
+
+
+def structure(value: Any) -> Any:
+    """Names and kinds; of a list, of its first element; neither sizes nor values."""
+    if isinstance(value, Tensor):
+        return f"{str(value.dtype).removeprefix('torch.')} of {value.dim()} dimensions"
+    if isinstance(value, dict):
+        ours = {str(key): part for key, part in value.items() if key != "param_groups"}  # torch's own, by its version
+        return {key: structure(part) for key, part in sorted(ours.items())}
+    if isinstance(value, list | tuple):
+        return [structure(value[0])] if value else []
+    return type(value).__name__
+
+
+def test_the_files_are_those_of_their_format(stopped: Path) -> None:
+    found: dict[str, Any] = {"format": checkpoint.FORMAT}
+    for method in CONFIGS:
+        for file in sorted((stopped / method).glob("*.pt")):
+            found[f"{method} {file.stem}"] = structure(torch.load(file, weights_only=True))
+    if "ADVTEX_RENEW" in os.environ:
+        KNOWN.write_text(json.dumps(found, indent=1) + "\n")
+    assert found == json.loads(KNOWN.read_text()), "raise FORMAT in checkpoint.py, and renew this test's file"
+
+
+def resumed(stopped: Path, folder: Path, method: str = "adversarial") -> list[str]:
+    """What a run that goes on from a copy of the work folder notes."""
+    monitor = Listens()
+    result = texture_scan(
+        stopped / "scan", folder / "out", CONFIGS[method], work=folder / "work", resume=True, monitor=monitor
+    )
+    assert monitor.step == 6
+    assert (folder / "out" / "model.glb") in result.files
+    return monitor.notes
+
+
+@pytest.fixture
+def folder(stopped: Path, tmp_path: Path) -> Path:
+    shutil.copytree(stopped / "adversarial", tmp_path / "work")
+    return tmp_path
+
+
+def test_files_of_this_version_are_used_without_a_word(stopped: Path, folder: Path) -> None:
+    assert not [note for note in resumed(stopped, folder) if "work folder" in note]
+
+
+def test_what_another_version_left_is_made_anew(stopped: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("advtex_engine.stages.fingerprint.FORMAT", checkpoint.FORMAT + 1)
+    (note,) = [note for note in resumed(stopped, folder) if "work folder" in note]
+    assert "by another version" in note
+
+
+@pytest.mark.parametrize("name", ["scene", "stages", "atlas", "view_maps_1", "initial_texture", "checkpoint"])
+@pytest.mark.parametrize("fault", ["lacks a name", "not a file of torch", "a broken pickle"])
+def test_a_file_that_lacks_something_or_is_broken_is_made_anew(
+    stopped: Path, folder: Path, name: str, fault: str
+) -> None:
+    file = folder / "work" / f"{name}.pt"
+    if fault == "lacks a name":
+        content = torch.load(file, weights_only=True)
+        del content[next(key for key in content if key != "fingerprint")]
+        torch.save(content, file)
+    else:
+        file.write_bytes((b"" if fault == "not a file of torch" else b"\x80\x02") + b"garbage" * 100)
+    (note,) = [note for note in resumed(stopped, folder) if "work folder" in note]
+    assert f"{name}.pt" in note

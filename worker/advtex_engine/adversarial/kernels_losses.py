@@ -1,0 +1,167 @@
+"""Triton kernels of the losses; `triton_losses.py` launches them and names each one's plain twin in torch."""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+MIN_FOREGROUND = tl.constexpr(0.1)
+MIN_UNOCCLUDED = tl.constexpr(0.5)
+
+
+@triton.jit
+def softplus(x):
+    return tl.maximum(x, 0.0) + tl.log(1.0 + tl.exp(-tl.abs(x)))
+
+
+@triton.jit
+def sigmoid(x):
+    return 1.0 / (1.0 + tl.exp(-x))
+
+
+@triton.jit
+def patches(shares, at, live, COUNT: tl.constexpr):
+    """1 or 0: which patches count for the texture, and which for the discriminator. shares: [2,COUNT]."""
+    inside = tl.load(shares + at, mask=live, other=0.0)
+    seen = tl.load(shares + COUNT + at, mask=live, other=0.0)
+    of_texture = live & (inside >= MIN_FOREGROUND)
+    of_discriminator = of_texture & (seen > inside * MIN_UNOCCLUDED)
+    return of_texture.to(tl.float32), of_discriminator.to(tl.float32)
+
+
+@triton.jit
+def judge(
+    real,
+    fake,
+    shares,
+    pretraining,
+    of_discriminator,
+    of_texture,
+    ahead,
+    counts,
+    COUNT: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Both players' losses over COUNT logits, whether the discriminator is ahead, and how many count for each [2]."""
+    lost, fooled, judged, drawn = (
+        tl.zeros((BLOCK,), tl.float32),
+        tl.zeros((BLOCK,), tl.float32),
+        tl.zeros((BLOCK,), tl.float32),
+        tl.zeros((BLOCK,), tl.float32),
+    )
+    for first in range(0, COUNT, BLOCK):
+        at = first + tl.arange(0, BLOCK)
+        live = at < COUNT
+        texture, discriminator = patches(shares, at, live, COUNT)
+        of_real = tl.load(real + at, mask=live, other=0.0).to(tl.float32)
+        of_fake = tl.load(fake + at, mask=live, other=0.0).to(tl.float32)
+        lost += (softplus(-of_real) + softplus(of_fake)) * discriminator
+        fooled += softplus(-of_fake) * texture
+        judged += discriminator
+        drawn += texture
+    first_count, second_count = tl.maximum(tl.sum(judged, 0), 1.0), tl.maximum(tl.sum(drawn, 0), 1.0)
+    first_loss, second_loss = tl.sum(lost, 0) / first_count, tl.sum(fooled, 0) / second_count
+    tl.store(of_discriminator, first_loss)
+    tl.store(of_texture, second_loss)
+    tl.store(ahead, tl.where(first_loss <= second_loss, 1.0 - tl.load(pretraining), 0.0))
+    tl.store(counts, first_count)
+    tl.store(counts + 1, second_count)
+
+
+@triton.jit
+def judge_backward(
+    real,
+    fake,
+    shares,
+    counts,
+    of_discriminator,
+    of_texture,
+    into_real,
+    into_fake,
+    COUNT: tl.constexpr,
+    JUDGED: tl.constexpr,
+    DRAWN: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Gradients of the logits. JUDGED, DRAWN: whether there is one of the discriminator's loss, of the texture's."""
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = at < COUNT
+    texture, discriminator = patches(shares, at, live, COUNT)
+    of_fake = tl.load(fake + at, mask=live, other=0.0).to(tl.float32)
+    gradient = tl.zeros((BLOCK,), tl.float32)
+    if JUDGED:
+        scale = tl.load(of_discriminator) / tl.load(counts) * discriminator
+        of_real = tl.load(real + at, mask=live, other=0.0).to(tl.float32)
+        tl.store(into_real + at, -sigmoid(-of_real) * scale, mask=live)
+        gradient += sigmoid(of_fake) * scale
+    if DRAWN:
+        gradient -= sigmoid(-of_fake) * texture * (tl.load(of_texture) / tl.load(counts + 1))
+    tl.store(into_fake + at, gradient, mask=live)
+
+
+@triton.jit
+def l1(a, b, visible, sums, PARTS: tl.constexpr, PIXELS: tl.constexpr, BLOCK: tl.constexpr):
+    """sums [2,PARTS]: of |a - b| over each block's visible pixels of rows [P,3], and of these pixels."""
+    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = pixel < PIXELS
+    seen = tl.load(visible + pixel, mask=live, other=0.0)
+    apart = tl.zeros((BLOCK,), tl.float32)
+    for channel in tl.static_range(3):
+        at = pixel * 3 + channel
+        apart += tl.abs(tl.load(a + at, mask=live, other=0.0) - tl.load(b + at, mask=live, other=0.0))
+    tl.store(sums + tl.program_id(0), tl.sum(apart * seen, 0))
+    tl.store(sums + PARTS + tl.program_id(0), tl.sum(seen, 0))
+
+
+@triton.jit
+def l1_mean(sums, mean, count, PARTS: tl.constexpr, BLOCK: tl.constexpr):
+    """The quotient of the sums' totals, and how many numbers it is the mean of, at least 1."""
+    apart, seen = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
+    for first in range(0, PARTS, BLOCK):
+        part = first + tl.arange(0, BLOCK)
+        apart += tl.load(sums + part, mask=part < PARTS, other=0.0)
+        seen += tl.load(sums + PARTS + part, mask=part < PARTS, other=0.0)
+    numbers = tl.maximum(3.0 * tl.sum(seen, 0), 1.0)
+    tl.store(mean, tl.sum(apart, 0) / numbers)
+    tl.store(count, numbers)
+
+
+@triton.jit
+def l1_backward(a, b, visible, gradient, count, into, PIXELS: tl.constexpr, BLOCK: tl.constexpr):
+    """The mean's gradient times the sign of a - b where it is visible."""
+    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = pixel < PIXELS
+    scale = tl.load(gradient) / tl.load(count) * tl.load(visible + pixel, mask=live, other=0.0)
+    for channel in tl.static_range(3):
+        at = pixel * 3 + channel
+        apart = tl.load(a + at, mask=live, other=0.0) - tl.load(b + at, mask=live, other=0.0)
+        tl.store(into + at, tl.where(apart > 0, scale, tl.where(apart < 0, -scale, 0.0)), mask=live)
+
+
+@triton.jit
+def difference(a, b, sums, COUNT: tl.constexpr, BLOCK: tl.constexpr):
+    """Sum of |a - b| over each block, float32."""
+    at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    live = at < COUNT
+    value = tl.load(a + at, mask=live, other=0.0).to(tl.float32) - tl.load(b + at, mask=live, other=0.0).to(tl.float32)
+    tl.store(sums + tl.program_id(0), tl.sum(tl.abs(value), 0))
+
+
+@triton.jit
+def difference_mean(sums, mean, COUNT: tl.constexpr, PARTS: tl.constexpr, BLOCK: tl.constexpr):
+    """The sums' total over COUNT."""
+    total = tl.zeros((BLOCK,), tl.float32)
+    for first in range(0, PARTS, BLOCK):
+        part = first + tl.arange(0, BLOCK)
+        total += tl.load(sums + part, mask=part < PARTS, other=0.0)
+    tl.store(mean, tl.sum(total, 0) / COUNT)
+
+
+@triton.jit
+def difference_backward(a, b, gradient, into, COUNT: tl.constexpr, BLOCK: tl.constexpr):
+    """The mean's gradient times the sign of a - b."""
+    at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    live = at < COUNT
+    value = tl.load(a + at, mask=live, other=0.0).to(tl.float32) - tl.load(b + at, mask=live, other=0.0).to(tl.float32)
+    scale = tl.load(gradient) / COUNT
+    tl.store(into + at, tl.where(value > 0, scale, tl.where(value < 0, -scale, 0.0)), mask=live)

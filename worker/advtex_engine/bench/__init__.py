@@ -1,0 +1,1 @@
+"""Times, bytes and operations of the stages and of a step."""

@@ -1,0 +1,147 @@
+"""What an optimization needs of its device's memory.
+
+Every part is counted from sizes and types: view maps, slot maps and dense textures as they are stored; per texel of the
+compact texture its value, gradient, Adam's moments and what the preset keeps beside them; the discriminator; the
+activations of the crop by layer; and what else a step holds per pixel of the crop. The last was read off torch's
+allocator, as the bytes alive at the fullest moment of a step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from advtex_engine.adversarial.optimizer import crop_size
+from advtex_engine.core.config import Preset
+from advtex_engine.render.view_maps import BYTES_PER_PIXEL
+from advtex_engine.runtime.available_memory import CONTEXT
+
+FLOAT = 4
+TEXEL = 3 * FLOAT  # of a texture, three channels
+SLOT = 4  # of a slot map
+LAYERS = ((64, 2), (128, 2), (128, 2), (128, 1), (1, 1))  # channels and strides of the discriminator
+PARAMETERS = 664_001
+SCHEDULED = 5 * FLOAT  # per step of the run, its row of the schedule
+# On a GPU, from torch's allocator: cuBLAS keeps 32 MiB on Hopper and 8 on others (torch's defaults); what cuDNN and
+# cuFFT ask for comes and goes. Not measured yet.
+WORKSPACES = 64 << 20
+# Per pixel of the crop. With features the fullest moment is at the beginning of the texture's gradient, while examples
+# and footprints are still needed, without them in the discriminator's gradient.
+HELD_WITH_FEATURES, HELD = 78, 5
+SPREAD, SPREAD_PIXEL = 16, 6  # or it is where the texture's gradient is made: per texel, per pixel of the crop
+CONVOLUTIONS = 360  # per pixel of the crop: what oneDNN keeps by itself, on a CPU
+LIBRARIES = 174 << 20  # on a CPU: code, tables and threads of what steps are the first to use; 158 to 197 were seen
+FILLING = 79  # per texel of a dense texture that is made from a compact one
+SPLATTING = 240  # per pixel of a view that is averaged into the mean texture
+VGG_PIXEL = 10_000  # per pixel of the crop of its features' network, both examples
+VGG_CROP = 128
+
+
+@dataclass(frozen=True)
+class Workload:
+    """What decides the memory of an optimization.
+
+    views: of width x height pixels, all of them. texture: width and height. slots: texels that views sample.
+    device: "cpu" or "cuda". bfloat16: whether the networks' activations are.
+    """
+
+    views: int
+    width: int
+    height: int
+    texture: tuple[int, int]
+    slots: int
+    method: str
+    preset: Preset
+    device: str = "cpu"
+    bfloat16: bool = False
+
+    @property
+    def draws_pairs(self) -> bool:
+        """Whether the method has a step that draws a pair of views, and can do with a part of them at a time."""
+        return self.plays or self.method == "vgg"
+
+    @property
+    def plays(self) -> bool:
+        """Whether there is a discriminator."""
+        return self.method.startswith("adversarial")
+
+    @property
+    def crop(self) -> tuple[int, int]:
+        """The crop (width, height) of a step at full size, in pixels."""
+        return crop_size(self.width, self.height, self.preset.max_crop)
+
+    @property
+    def scales(self) -> tuple[int, ...]:
+        """Those of which maps are kept."""
+        return tuple(sorted({1, *(level.scale for level in self.preset.levels)}))
+
+
+def estimate(work: Workload, on_device: int | None = None) -> dict[str, int]:
+    """Bytes by part; their sum is the peak. on_device: views of full size that are there at a time, None for all."""
+    texels = work.texture[0] * work.texture[1]
+    shares = sum(1 / scale**2 for scale in work.scales)
+    views = work.views * shares if on_device is None else on_device
+    starts = work.plays and work.preset.start == "selection"
+    step = _step(work)
+    filling = max(FILLING * texels, SPLATTING * work.width * work.height)
+    parts = {
+        "view_maps": int(views * work.width * work.height * BYTES_PER_PIXEL),
+        "slot_maps": int(texels * SLOT * shares),
+        "dense_textures": int(texels * TEXEL * (shares + starts)),
+        **step,
+        # Before and after the steps: what a step needs is not there then, apart from the texture's own state.
+        "filling": max(0, filling - step["activations"] - step["step"]),
+    }
+    if work.device == "cuda":
+        parts["context"] = CONTEXT
+        if work.plays:
+            parts["workspaces"] = WORKSPACES
+    elif work.plays:
+        parts["convolutions"] = CONVOLUTIONS * work.crop[0] * work.crop[1]
+        parts["libraries"] = LIBRARIES
+    return parts
+
+
+def tensor_bytes(parts: dict[str, int]) -> int:
+    """The bytes of an estimate that torch's allocator counts."""
+    return sum(size for name, size in parts.items() if name not in ("context", "convolutions", "libraries"))
+
+
+def activations(width: int, height: int, size: int) -> list[int]:
+    """Bytes that are kept of each of the discriminator's layers for its gradient, for one example, `size` per value.
+
+    A convolution's output is kept, and what the leaky ReLU makes of it, apart from the last one's, which has none.
+    """
+    kept = []
+    for number, (channels, stride) in enumerate(LAYERS):
+        width, height = (width - 2) // stride + 1, (height - 2) // stride + 1
+        kept.append(channels * width * height * size * (2 if number < len(LAYERS) - 1 else 1))
+    return kept
+
+
+def _step(work: Workload) -> dict[str, int]:
+    if work.method == "vgg":
+        pixels = min(VGG_CROP, work.width) * min(VGG_CROP, work.height)
+        return {"compact_texture": 4 * TEXEL * work.slots, "activations": VGG_PIXEL * pixels, "step": 0}
+    if work.method == "l1":  # spread over four texels per pixel, with their indices and weights
+        return {"compact_texture": 5 * TEXEL * work.slots, "activations": 0, "step": 200 * work.width * work.height}
+    if not work.plays:
+        return {"compact_texture": 2 * TEXEL * work.slots, "activations": 0, "step": 0}
+    preset, (width, height) = work.preset, work.crop
+    # Value, gradient and two moments.
+    beside = (preset.l1_target == "start") + bool(preset.averaging)
+    size = 2 if work.bfloat16 else FLOAT
+    pixels = width * height
+    on_gpu = work.device == "cuda"
+    # On a CPU both examples are float32, and are copied where the activations are not.
+    shown = 2 * 8 * size * pixels if on_gpu else 2 * 6 * (FLOAT + size % FLOAT) * pixels
+    features = bool(preset.feature_weight)
+    differences = sum(activations(width, height, FLOAT)[:-1]) // 2 if features else 0
+    held = (HELD_WITH_FEATURES if features else HELD) * pixels
+    fullest = max(shown + held, SPREAD * work.slots + SPREAD_PIXEL * pixels)
+    return {
+        "compact_texture": (4 + beside) * TEXEL * work.slots,
+        # Values, gradients, two moments; the gradients of either example, and what they are gradients of.
+        "discriminator": (4 * FLOAT + (3 if work.bfloat16 else 2) * size) * PARAMETERS + SCHEDULED * preset.steps,
+        "activations": 2 * sum(activations(width, height, size)),
+        "step": differences + fullest,
+    }

@@ -1,0 +1,235 @@
+"""Every number of the method, named once.
+
+Preset      the paper's symbols beside ours: steps, start, lr_texture, lr_discriminator, l1_weight (lambda), l1_decay
+TextureConfig   what one run is asked to do
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from advtex_engine.core.errors import OptionError
+
+
+@dataclass(frozen=True)
+class PyramidLevel:
+    """`steps` at 1/scale of the working size and of the texture's size."""
+
+    steps: int
+    scale: int = 1
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Hyper-parameters of the optimization (paper sections 3.2 and 4; supplement "Training").
+
+    levels            coarse-to-fine schedule; one level for everything but `preview`
+    start             "zero" (black, as printed), "mean" (the projected mean) or "selection" (one view per face)
+    toned             the views' wide averages are made the start's (paper: views as photographed)
+    pretraining       first steps, counted in `levels`, in which the discriminator learns alone
+    lr_texture        1e-3, Adam; colors in [0, 1]. Adam's step is as long however rarely a view shows the texel and
+                      however faint its gradient is: it is noise that accumulates while nothing holds it back
+    lr_unit           of lr_texture: "color" (1, as the paper's) or "disagreement", the root of the mean absolute
+                      difference of the views to the start
+    lr_discriminator  1e-4, Adam
+    lr_follows        power of lambda's decay by which the texture's rate falls (paper: 0, not at all)
+    lr_end            share of both at the last step, reached in a straight line (paper: 1, no decay)
+    beta1             0.5
+    l1_weight         lambda = 10 at the start
+    l1_target         "auxiliary" (the warped auxiliary image, where that view sees: the paper's text), "source" (the
+                      source image, wherever it shows the mesh: its supplement A) or "start" (the start's own render)
+    l1_decay          lambda is multiplied by this `l1_decays` times over the run (paper: 0.8 every 1,000 of 50,000)
+    feature_weight    of the distance between what the discriminator's layers respond to the render and to the real
+                      example (paper: 0); tolerant to shifts as they are, it averages less than L1 does
+    averaging         steps over which the resulting texture is averaged (as printed: none, the last state)
+    alignment         both examples are moved onto the source image before they are judged (Zhao et al. 2022)
+    perturbation      of the view's width, by which virtual motions of the auxiliary camera shift its image at most
+                      (paper: 0; its supplement D proposes them for sparse views)
+    max_crop          largest crop (width, height) in pixels; larger views are seen in parts, for cheaper steps
+    max_pair_angle    largest angle between the optical axes of a pair, degrees (released code: 15)
+    min_pair_overlap  least share of the source's foreground that the auxiliary view sees
+    nearest_share     of the views that remain for a source, rounded up, those whose warped images differ least from it
+    auxiliary         real examples are warped auxiliary views; else the source itself (ablation, paper section 4)
+    condition         the discriminator is shown the source image; else the example alone (ablation, paper section 4)
+    """
+
+    levels: tuple[PyramidLevel, ...]
+    start: Literal["zero", "mean", "selection"]
+    toned: bool = False
+    pretraining: int = 0
+    lr_texture: float = 1e-3
+    lr_unit: Literal["color", "disagreement"] = "color"
+    lr_discriminator: float = 1e-4
+    lr_follows: float = 0.0
+    lr_end: float = 1.0
+    beta1: float = 0.5
+    l1_weight: float = 10.0
+    l1_target: Literal["auxiliary", "source", "start"] = "auxiliary"
+    l1_decay: float = 0.8
+    l1_decays: float = 50.0
+    feature_weight: float = 0.0
+    averaging: int = 0
+    alignment: bool = False
+    perturbation: float = 0.0
+    max_crop: tuple[int, int] | None = None
+    max_pair_angle: float = 15.0
+    min_pair_overlap: float = 0.3
+    nearest_share: float = 1.0
+    auxiliary: bool = True
+    condition: bool = True
+
+    @property
+    def steps(self) -> int:
+        """Optimiser iterations over all levels."""
+        return sum(level.steps for level in self.levels)
+
+
+PRINTED = Preset(levels=(PyramidLevel(50_000),), start="zero")
+"""The paper's recipe to the letter (section 3.2). In 3D it speckles: `PAPER` says what is chosen otherwise, and why."""
+
+# What the paper leaves open; `tests/benchmarks/paper.py --rows suspects` tries each choice by itself.
+PAPER = replace(
+    PRINTED,
+    # Black is far from any texture, and a texel that a tenth of the views show takes 2,000 steps to get away from it;
+    # the discriminator meets nothing but unfinished textures meanwhile.
+    start="mean",
+    # Frames differ in exposure, and a texture has but one tone. Where a render is told from the real example by its
+    # tone, the texture can give no answer: on a kitchen it ended at 1.57 times the LPIPS of the texture of least L1
+    # distance, and at .79 times that with views in one tone.
+    toned=True,
+    # In the paper's case of two dimensions every step shows every texel. Here a view shows a tenth of them: Adam's
+    # moments, means over all steps, make a step about 1 / sqrt(.1) times the rate for each time that the texel is seen.
+    # How far a texel has to go depends on how far the views disagree, by .03 on a kitchen and by .13 on an object of
+    # strong colors with wrong cameras, where a rate for kitchens ends half way; what the noise of the steps costs does
+    # not. A rate in proportion speckles where they disagree, an even one blurs: the root lies between.
+    lr_texture=6e-4,
+    lr_unit="disagreement",
+    # Steps pay while lambda holds them together. Later noise adds up, and the texture drifts from the photographs to
+    # all that the discriminator has not learned to tell from them.
+    lr_follows=0.5,
+    # The warped auxiliary image is displaced by the errors of two cameras, the source by those of one.
+    l1_target="source",
+    # A texture that cannot be told from the real examples is as far from the photographs as they are: on two kitchens
+    # those of all pairs have 1.13 and .77 times the LPIPS of the texture of least L1 distance, those of the better half
+    # .77 and .59 times (`tests/benchmarks/examples.py`).
+    nearest_share=0.5,
+)
+# From a sharp start the paper's weights blur: the L1 term only holds on to the start, features are matched, and the
+# discriminator has been trained before the texture listens to it.
+STANDARD = Preset(
+    levels=(PyramidLevel(1_500),),
+    start="selection",
+    toned=True,
+    pretraining=150,
+    lr_texture=4e-4,
+    lr_discriminator=8e-4,
+    lr_end=0.05,
+    l1_weight=1.0,
+    l1_target="start",
+    l1_decays=0,
+    feature_weight=10.0,
+    averaging=1_000,
+    alignment=True,
+    max_crop=(384, 288),
+)
+PRESETS: dict[str, Preset] = {
+    "paper": PAPER,
+    "full": replace(
+        STANDARD,
+        levels=(PyramidLevel(50_000),),
+        # The same way in smaller steps: a discriminator that has gone further than standard's spoils the texture.
+        pretraining=5_000,
+        lr_texture=1.6e-5,
+        lr_discriminator=3.2e-5,
+        averaging=12_000,
+        max_crop=None,
+    ),
+    "standard": STANDARD,
+    "preview": replace(
+        STANDARD, levels=(PyramidLevel(800, scale=2), PyramidLevel(300)), pretraining=120, averaging=100
+    ),
+}
+METHODS = (
+    "adversarial",
+    "adversarial_no_auxiliary",
+    "adversarial_no_condition",
+    "best_view",
+    "colormap",
+    "l1",
+    "mean",
+    "sharpest",
+    "vgg",
+    "view_selection",
+)
+
+
+@dataclass(frozen=True)
+class TextureConfig:
+    """What one run is asked to do.
+
+    preset            a name of PRESETS, or "auto": full on a GPU, standard on a CPU
+    size              working size (width, height) of the views in pixels; None keeps the scan's
+    holdout           N leaves out of every stage the sorted frames whose position % N == N // 2
+    steps             overrides the preset's step count, its levels scaled in proportion
+    face_budget       the mesh is decimated to at most this many faces
+    max_views         of a longer scan, these many frames are chosen; fewer where their maps would not fit into memory
+    max_texture_size  cap on the texture's side in texels
+    layout            name of the scan's layout; None takes the one that fits best
+    memory_bytes      what the run may take of a GPU that others use too; None: all that is free
+    refine            cameras and exposures are refined first; never for the preset "paper", which has no such stage
+    """
+
+    preset: str = "auto"
+    method: str = "adversarial"
+    size: tuple[int, int] | None = None
+    holdout: int | None = None
+    steps: int | None = None
+    face_budget: int = 80_000
+    max_views: int = 240
+    max_texture_size: int = 4096
+    texels_per_pixel: float = 1.2
+    refine: bool = True
+    device: str = "auto"
+    seed: int = 0
+    checkpoint_seconds: float = 30.0
+    layout: str | None = None
+    memory_bytes: int | None = None
+
+    @property
+    def refines(self) -> bool:
+        """Whether cameras and exposures are refined first; the method colormap is nothing without."""
+        return self.method == "colormap" or (self.refine and self.preset != "paper")
+
+    def __post_init__(self) -> None:
+        if self.preset != "auto" and self.preset not in PRESETS:
+            raise OptionError(f"preset {self.preset!r} is unknown; choose one of auto, {', '.join(PRESETS)}")
+        if self.method not in METHODS:
+            raise OptionError(f"method {self.method!r} is unknown; choose one of {', '.join(METHODS)}")
+        if self.size is not None and not all(64 <= side <= 4096 for side in self.size):
+            raise OptionError(f"size {self.size[0]}x{self.size[1]} is out of bounds; each side takes 64 to 4096 pixels")
+        if self.holdout is not None and self.holdout < 2:
+            raise OptionError(f"holdout {self.holdout} is out of bounds; 2 or more leaves every Nth frame out")
+        if self.steps is not None and self.steps < 1:
+            raise OptionError(f"steps {self.steps} is out of bounds; at least 1 is needed")
+        if self.face_budget < 100:
+            raise OptionError(f"face budget {self.face_budget} is out of bounds; at least 100 faces are needed")
+        if self.max_views < 2:
+            raise OptionError(f"max views {self.max_views} is out of bounds; at least 2 are compared with each other")
+        if not 256 <= self.max_texture_size <= 16384:
+            raise OptionError(f"max texture size {self.max_texture_size} is out of bounds; 256 to 16384 texels fit")
+
+
+def resolve_preset(config: TextureConfig, device_type: str) -> Preset:
+    """The preset's numbers, "auto" decided by the device ("cpu" or "cuda") and the steps overridden where asked."""
+    name = config.preset
+    if name == "auto":
+        name = "full" if device_type == "cuda" else "standard"
+    preset = PRESETS[name]
+    if config.steps is None:
+        return preset
+    share = config.steps / preset.steps
+    levels = [PyramidLevel(round(level.steps * share), level.scale) for level in preset.levels]
+    levels[-1] = PyramidLevel(config.steps - sum(level.steps for level in levels[:-1]), levels[-1].scale)
+    pretraining, averaging = int(preset.pretraining * share), int(preset.averaging * share)
+    return replace(preset, levels=tuple(levels), pretraining=pretraining, averaging=averaging)

@@ -1,0 +1,279 @@
+"""How well a textured model shows what photographs show that it was not made from.
+
+A pixel counts where the scan's mesh is hit and the device's depth, where the scan has any, is there and agrees with it:
+the same pixels for every model of a scan. Where the model itself shows nothing, or a surface elsewhere, it is scored as
+black: leaving difficult faces out does not help. Outside of these pixels both images hold the photograph.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advtex_engine.core.config import TextureConfig
+from advtex_engine.core.errors import EngineError, Problem, ScanError
+from advtex_engine.core.monitor import Monitor
+from advtex_engine.core.scene import TO_Y_UP, Atlas, Fragments, Mesh, Scene, View, evenly_spread
+from advtex_engine.ingest.read import load_scene
+from advtex_engine.mesh.models import load_model, load_reference
+from advtex_engine.metrics.image_metrics import METRICS, nearest_patch_loss
+from advtex_engine.metrics.lpips import Lpips, WeightsError, load_lpips
+from advtex_engine.metrics.sharpness import band_error, flat_energy, s3_ratio
+from advtex_engine.refine.heldout import refine_heldout
+from advtex_engine.render.pictures import contact_sheet
+from advtex_engine.render.rasterize import rasterize
+from advtex_engine.render.render_view import render_layers
+from advtex_engine.runtime.available_memory import available_memory
+from advtex_engine.runtime.files import json_text, write_atomically
+from advtex_engine.runtime.threads import in_threads, one_thread_each
+from advtex_scan.archive import open_scan
+from advtex_scan.check import read_scan
+from advtex_scan.errors import Finding, ScanFormatError
+
+DEPTH_AGREEMENT = 0.05
+"""Metres between the depths of device, scan's mesh and model."""
+MIN_PIXELS = 500
+"""Views in which fewer pixels count are left out."""
+PATCH_QUERIES = 1000
+"""Patches per view whose nearest ones are sought."""
+TEXELS_PER_SAMPLE, MIN_SUPERSAMPLE, MAX_SUPERSAMPLE = 1.5, 2, 6
+"""A pixel is sampled so finely that neighboring samples lie this far apart in the texture, within these bounds."""
+SHEET_VIEWS = 12
+# What the patches of a view take while it is scored, and all else by its size; 300 MB were seen at 640x480.
+BYTES_PER_SCORED_VIEW, BYTES_PER_SCORED_PIXEL = 270 << 20, 400
+
+Metric = Callable[[Tensor, Tensor, Tensor], float]
+
+VIEW_METRICS: dict[str, Metric] = {
+    **METRICS,
+    "band_error": band_error,
+    "s3_ratio": s3_ratio,
+    "flat_energy": flat_energy,
+}
+PATCH_METRICS: dict[str, Metric] = {
+    "nearest_patch": lambda image, photo, mask: nearest_patch_loss(image, photo, mask, queries=PATCH_QUERIES),
+    "nearest_patch_reverse": lambda image, photo, mask: nearest_patch_loss(photo, image, mask, queries=PATCH_QUERIES),
+}
+Scores = dict[str, float | None]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A view's photograph and what the model shows in its place.
+
+    photo, image: [H,W,3] float32 sRGB in [0,1]; image equals photo outside the mask and is black where the model shows
+    nothing. mask: [H,W] bool, the pixels that count; covered: those of them where the model is.
+    """
+
+    name: str
+    photo: Tensor
+    image: Tensor
+    mask: Tensor
+    covered: Tensor
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Scores per view and their means; `missing` says why a metric has none.
+
+    refined: per view how far its camera was moved against the model before scoring, None if no camera was.
+    """
+
+    per_view: list[dict[str, Any]]
+    mean: dict[str, Any]
+    missing: dict[str, str]
+    refined: list[dict[str, Any]] | None = None
+
+
+def evaluate(
+    model: Path,
+    scan: Path,
+    *,
+    size: tuple[int, int] | None = None,
+    holdout: int | None = None,
+    layout: str | None = None,
+    reference: Path | None = None,
+    weights: Path | None = None,
+    sheet: Path | None = None,
+    refine_poses: bool = False,
+    monitor: Monitor | None = None,
+) -> Evaluation:
+    """Scores an OBJ or GLB against a scan's held-out frames, or against all frames without `holdout`.
+
+    size: width and height of the renders and photographs in pixels; None keeps the scan's. layout: of the scan; None
+    takes the one that fits best. reference: a mesh file that
+    decides which pixels count, by default the scan's mesh; models compared with each other need the same one. weights:
+    see `perceptual.weights_folder`; without them `lpips` and `lpips_full` are None. sheet: PNG to write, photograph |
+    render | difference. refine_poses: the frames' poses are refined against the model first, to tell a texture that is
+    displaced from one that is wrong. Raises ScanError, ModelError, OptionError, and EngineError when no view can be
+    scored.
+    """
+    scene = _load_views(scan, TextureConfig(size=size, holdout=holdout, layout=layout), monitor or Monitor())
+    target = scene.mesh if reference is None else load_reference(reference)
+    atlas, texture = load_model(model)
+    if model.suffix.lower() == ".glb":
+        atlas = replace(atlas, mesh=_from_y_up(atlas.mesh, scene.up_axis))
+    lpips, missing = configured_lpips(weights)
+    views, refined = scene.views, None
+    if refine_poses:
+        views, refined = refine_heldout(atlas, texture, views, scene.kind)
+    shown = {view.name for view in evenly_spread(views, SHEET_VIEWS)} if sheet is not None else set()
+    rows, pictures = list[dict[str, Any]](), list[tuple[View, Comparison]]()
+    for view in views:
+        comparison = compare(atlas, texture, view, target)
+        if comparison is None:
+            continue
+        rows.append({"view": view.name, **score(comparison, lpips, {**VIEW_METRICS, **PATCH_METRICS})})
+        if view.name in shown:
+            pictures.append((view, comparison))
+    if not any(row["coverage"] for row in rows):
+        raise EngineError(
+            f"{model}: no view shows it where the scan's mesh is; export it in the scan's world coordinates, in metres"
+        )
+    if sheet is not None and pictures:
+        _write_sheet(pictures, sheet)
+    return Evaluation(rows, mean_scores(rows), missing, refined)
+
+
+def configured_lpips(folder: Path | None = None) -> tuple[Lpips | None, dict[str, str]]:
+    """LPIPS, or None and the reason per metric that goes without it."""
+    try:
+        return load_lpips(folder), {}
+    except WeightsError as error:
+        return None, {name: str(error) for name in ("lpips", "lpips_full")}
+
+
+def compare(atlas: Atlas, texture: Tensor, view: View, reference: Mesh | None = None) -> Comparison | None:
+    """The model at the view's camera, beside the photograph; None when fewer than MIN_PIXELS count.
+
+    texture: [atlas.height,atlas.width,3] uint8 sRGB or float in [0,1]. reference: the mesh that decides which pixels
+    count, by default the model's own.
+    """
+    fragments = rasterize(atlas.mesh, view.camera)
+    target = fragments if reference is None else rasterize(reference, view.camera)
+    mask = target.face_index >= 0
+    if view.depth is not None:
+        mask = mask & (view.depth > 0) & ((view.depth - target.depth).abs() < DEPTH_AGREEMENT)
+    if view.mask is not None:
+        mask = mask & view.mask
+    if int(mask.sum()) < MIN_PIXELS:
+        return None
+    covered = mask & (fragments.face_index >= 0) & ((fragments.depth - target.depth).abs() < DEPTH_AGREEMENT)
+    color, cover = render_layers(atlas, texture, view.camera, supersample=_supersample(atlas, fragments))
+    color = color / cover.clamp(min=1e-6)[..., None]
+    photo = view.color.to(torch.float32) / 255
+    image = torch.where(mask[..., None], color * covered[..., None], photo)
+    return Comparison(view.name, photo, image, mask, covered)
+
+
+def score(comparison: Comparison, lpips: Lpips | None, metrics: dict[str, Metric]) -> Scores:
+    """All scores of a view; None where a metric says nothing (no weights, no flat pixels)."""
+    image, photo, mask = comparison.image, comparison.photo, comparison.mask
+    scores: Scores = {"lpips": None, "lpips_full": None}
+    if lpips is not None:
+        scores = {"lpips": lpips.masked(image, photo, mask), "lpips_full": lpips.on_black(image, photo, mask)}
+    scores |= {name: metric(image, photo, mask) for name, metric in metrics.items()}
+    scores["flat_energy"] = flat_energy(image, photo, comparison.covered)
+    scores["coverage"] = float(comparison.covered.sum() / mask.sum())
+    scores["mask_share"] = float(mask.to(torch.float32).mean())
+    return {name: None if value is None or math.isnan(value) else value for name, value in scores.items()}
+
+
+def mean_scores(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Per metric the mean over the views that have it, None when none has; `views` is their number."""
+    means: dict[str, Any] = {}
+    for name in [name for name in rows[0] if name != "view"] if rows else []:
+        known = [row[name] for row in rows if row[name] is not None]
+        means[name] = sum(known) / len(known) if known else None
+    return means | {"views": len(rows)}
+
+
+def score_views(atlas: Atlas, texture: Tensor, views: Sequence[View], lpips: Lpips | None) -> dict[str, Any]:
+    """Means over views of a model on the scan's own mesh, without the costly nearest patches; empty if none counts.
+
+    On the CPU, where the same model has the same scores on every machine; as many views side by side as there are
+    threads and room, since most of a view's work is of one thread.
+    """
+
+    def scored(view: View) -> Scores | None:
+        comparison = compare(atlas, texture, view)
+        return None if comparison is None else score(comparison, lpips, VIEW_METRICS)
+
+    pixels = max((view.camera.width * view.camera.height for view in views), default=1)
+    room = available_memory(torch.device("cpu")) // 2
+    at_once = min(torch.get_num_threads(), room // (BYTES_PER_SCORED_VIEW + BYTES_PER_SCORED_PIXEL * pixels))
+    with one_thread_each():
+        rows = [row for row in in_threads(scored, views, max(1, at_once)) if row is not None]
+    return mean_scores(rows) if rows else {}
+
+
+def write_json(path: Path, evaluation: Evaluation, described: dict[str, Any]) -> None:
+    """described: what was evaluated, put before the scores."""
+    content = {**described, **vars(evaluation)}
+    write_atomically(path, json_text(content, indent=1).encode() + b"\n")
+
+
+def _load_views(scan: Path, config: TextureConfig, monitor: Monitor) -> Scene:
+    """The scan with the evaluated frames as its views; the others are not decoded."""
+    try:
+        with open_scan(scan) as archive:
+            reading = read_scan(archive, config.layout)
+            errors = [finding for finding in reading.report.findings if finding.severity == "error"]
+            if errors or reading.manifest is None:
+                raise ScanError(*map(_problem, errors))
+            every = config.holdout
+            frames = tuple(
+                frame
+                for position, frame in enumerate(reading.manifest.frames)
+                if every is None or position % every == every // 2
+            )
+            if not frames:
+                raise EngineError(f"{scan}: no frame is held out; lower the holdout below {every}")
+            manifest = replace(reading.manifest, frames=frames)
+            return load_scene(archive, manifest, replace(config, holdout=None), monitor)
+    except ScanFormatError as error:
+        raise ScanError(*map(_problem, error.findings)) from error
+
+
+def _problem(finding: Finding) -> Problem:
+    return Problem(finding.code, finding.where, finding.message, finding.remedy)
+
+
+def _from_y_up(mesh: Mesh, up_axis: str) -> Mesh:
+    """A glTF's mesh, +Y up, turned into the scan's world."""
+    x, y, z, w = TO_Y_UP[up_axis]
+    axis = torch.tensor([x, y, z], dtype=torch.float64)
+    cross = torch.linalg.cross(axis.expand(3, 3), torch.eye(3, dtype=torch.float64)).T
+    turn = torch.eye(3, dtype=torch.float64) + 2 * w * cross + 2 * cross @ cross
+    return replace(mesh, v_pos=(mesh.v_pos.double() @ turn).to(torch.float32))
+
+
+def _supersample(atlas: Atlas, fragments: Fragments) -> int:
+    """Samples per pixel and axis, from the texture's median density in neighboring pixels of the same face."""
+    mesh = atlas.mesh
+    assert mesh.v_uv is not None
+    assert mesh.t_uv_idx is not None
+    face = fragments.face_index
+    left = ((face[:, :-1] >= 0) & (face[:, :-1] == face[:, 1:])).nonzero()
+    if len(left) == 0:
+        return MIN_SUPERSAMPLE
+    rows, columns = left.unbind(1)
+    corners = mesh.v_uv[mesh.t_uv_idx[face[rows, columns].long()]]
+    weights = fragments.barycentric
+    step = ((weights[rows, columns + 1] - weights[rows, columns])[:, :, None] * corners).sum(1)
+    texels = (step * step.new_tensor([atlas.width, atlas.height])).norm(dim=1)
+    return min(MAX_SUPERSAMPLE, max(MIN_SUPERSAMPLE, math.ceil(float(texels.median()) / TEXELS_PER_SAMPLE)))
+
+
+def _write_sheet(pictures: Sequence[tuple[View, Comparison]], path: Path) -> None:
+    rows = [
+        (comparison.image * comparison.mask[..., None], 0.5 + comparison.image - comparison.photo)
+        for _, comparison in pictures
+    ]
+    contact_sheet([view for view, _ in pictures], rows, ("render", "render minus photograph"), path)

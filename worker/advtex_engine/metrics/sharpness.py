@@ -1,0 +1,172 @@
+"""Is the render as sharp as the photograph, everywhere and in every band? Measures that forgive shifts of some pixels.
+
+Images are [H,W,3] float sRGB in [0,1], masks [H,W] bool, as in `image_metrics.py`. Windows may reach over the mask's
+edge: outside the mask both images should hold the same (the photograph), so that only the mask's inside makes a
+difference.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from advtex_engine.metrics.image_metrics import eroded, gradient_magnitude, luminance
+
+BANDS = 3
+BAND_SIGMA = 1.2
+"""Standard deviation in pixels of the low-pass whose rest is a band; each band has half the size of the one before."""
+TILE, LEAST_TILE = 32, 8
+"""Side of the tiles whose energies are compared, at full size and at least."""
+TILE_SHARE = 0.8
+"""Share of a tile that must lie in the mask."""
+BAND_FLOOR = 1e-5
+"""Energy that counts as nothing: that of 8-bit rounding and a little noise."""
+
+S3_BLOCK, S3_STEP = 32, 8
+S3_SLOPE, S3_CENTER = -3.0, 2.0
+"""The sigmoid from spectral slope to sharpness: beta_1 and beta_2 of the paper's equation 4."""
+S3_LEAST_CONTRAST, S3_LEAST_MEAN = 5.0, 2.0
+"""Gray levels; blocks below have no sharpness (paper section III-A)."""
+S3_SHARE = 0.95
+"""Share of a block that must lie in the mask."""
+
+FLAT_SIGMA = 1.5
+"""Standard deviation in pixels of the low-pass that separates fine texture, noise and ringing from shading."""
+FLAT_WINDOW = 17
+"""Side of the window that must be flat: edges that a misaligned render shows some pixels away stay out."""
+FLAT_GRADIENT = 0.8 / 255
+"""Root mean square of the smoothed photograph's gradient per pixel, below which a window is flat: shading, sensor noise
+and JPEG blocks pass, wood grain and carpets do not (looked at on photographs of two kitchens)."""
+FLAT_PIXELS = 500
+"""Flat pixels that a view must show for anything to be said of them."""
+
+
+def band_error(image: Tensor, truth: Tensor, mask: Tensor) -> float:
+    """Mean |ln| of the ratio of amplitudes in three bands of a Laplacian pyramid, tile by tile; 0 is best.
+
+    Tiles of 32, 16 and 8 pixels of the bands at full, half and quarter size count when they lie in the mask to 80 %.
+    Insensitive to small shifts; blur, noise and wrong texture show. NaN when no tile lies in the mask.
+    """
+    assert image.shape == truth.shape == (*mask.shape, 3)
+    planes = torch.stack((luminance(image), luminance(truth), mask.to(torch.float32)))
+    errors = []
+    for band in range(BANDS):
+        weight = planes[2]
+        energy = (planes[:2] - blurred(planes[:2], BAND_SIGMA)).square() * weight
+        tile = max(LEAST_TILE, TILE >> band)
+        if min(weight.shape) < tile:
+            break
+        ours, theirs, share = F.avg_pool2d(torch.cat((energy, weight[None]))[:, None], tile)[:, 0]
+        inside = share > TILE_SHARE
+        if bool(inside.any()):
+            ours, theirs = (part[inside] / share[inside] + BAND_FLOOR for part in (ours, theirs))
+            errors.append(float((ours / theirs).log().abs().mean()) / 2)
+        planes = _halved(planes)
+    return sum(errors) / len(errors) if errors else math.nan
+
+
+def s3_ratio(image: Tensor, truth: Tensor, mask: Tensor) -> float:
+    """Mean S3 sharpness of the image over that of the truth, in blocks that lie in the mask to 95 %; NaN without any.
+
+    S3 is that of `s3_map`. 1 is best, below is blurred.
+    """
+    assert image.shape == truth.shape == (*mask.shape, 3)
+    if min(mask.shape) < S3_BLOCK:
+        return math.nan
+    share = F.avg_pool2d(mask.to(torch.float32)[None, None], S3_BLOCK, S3_STEP)[0, 0]
+    inside = share > S3_SHARE
+    if not bool(inside.any()):
+        return math.nan
+    ours, theirs = (float(s3_map(picture)[inside].mean()) for picture in (image, truth))
+    return (ours + 1e-6) / (theirs + 1e-6)
+
+
+def s3_map(image: Tensor) -> Tensor:
+    """S3 (Vu, Phan, Chandler 2012, "A Spectral and Spatial Measure of Local Perceived Sharpness in Natural Images").
+
+    [H,W,3] -> [(H - 32) // 8 + 1, (W - 32) // 8 + 1] in [0,1], one value per 32x32 block: the geometric mean of
+    S1, from the slope of the block's magnitude spectrum, and S2, the largest total variation of 2x2 pixels near the
+    block's centre.
+    """
+    gray = luminance(image) * 255
+    rows, columns = ((side - S3_BLOCK) // S3_STEP + 1 for side in gray.shape)
+    blocks = gray.unfold(0, S3_BLOCK, S3_STEP).unfold(1, S3_BLOCK, S3_STEP)
+    near = (gray[:-1, :-1], gray[:-1, 1:], gray[1:, :-1], gray[1:, 1:])
+    variation = torch.zeros_like(near[0])
+    for first in range(4):
+        for second in range(first):
+            variation += (near[first] - near[second]).abs()
+    window = S3_BLOCK // 4
+    start = S3_BLOCK // 2 - window // 2
+    largest = F.max_pool2d(variation[None, None, start:, start:], window, S3_STEP)[0, 0, :rows, :columns]
+    spatial = (largest / (4 * 255)).clamp(0, 1)
+    return (_spectral_sharpness(blocks) * spatial).sqrt()
+
+
+def _spectral_sharpness(blocks: Tensor) -> Tensor:
+    """S1 of blocks [R,C,32,32] in gray levels -> [R,C] in [0,1]."""
+    hann = torch.hann_window(S3_BLOCK, periodic=False, device=blocks.device)
+    magnitude = torch.fft.fft2(blocks * (hann[:, None] * hann)).abs()
+    frequency = torch.fft.fftfreq(S3_BLOCK, 1 / S3_BLOCK, device=blocks.device)
+    ring = torch.hypot(frequency[:, None], frequency).round().long()
+    radii = torch.arange(1, S3_BLOCK // 2 + 1, device=blocks.device)
+    spectrum = torch.stack([magnitude[..., ring == radius].mean(-1) for radius in radii.tolist()], -1)
+    logs, positions = spectrum.clamp(min=1e-6).log(), radii.to(torch.float32).log()
+    positions = positions - positions.mean()
+    slope = -(logs * positions).sum(-1) / positions.square().sum()
+    sharpness = 1 - torch.sigmoid(-S3_SLOPE * (slope - S3_CENTER))
+    contrast = blocks.amax((-2, -1)) - blocks.amin((-2, -1))
+    visible = (contrast > S3_LEAST_CONTRAST) & (blocks.mean((-2, -1)) > S3_LEAST_MEAN)
+    return sharpness * visible
+
+
+def flat_energy(image: Tensor, truth: Tensor, mask: Tensor) -> float:
+    """Fine texture of the image over that of the truth where the truth is flat: above 1 ringing, speckles or seams.
+
+    The ratio of root mean squares of luminance minus its low-pass (`FLAT_SIGMA`) over `flat_pixels`. The photograph's
+    sensor noise is part of the reference: a render without any grain scores below 1. mask: pixels that the render
+    covers; its holes would be counted as texture. NaN below FLAT_PIXELS.
+    """
+    assert image.shape == truth.shape == (*mask.shape, 3)
+    flat = flat_pixels(truth, mask)
+    if int(flat.sum()) < FLAT_PIXELS:
+        return math.nan
+    planes = torch.stack((luminance(image), luminance(truth)))
+    ours, theirs = (planes - blurred(planes, FLAT_SIGMA))[:, flat].double().square().mean(1).sqrt().tolist()
+    return float((ours + 1e-6) / (theirs + 1e-6))
+
+
+def flat_pixels(truth: Tensor, mask: Tensor) -> Tensor:
+    """Where a photograph [H,W,3] is flat, [H,W] bool: nothing but noise and slow shading in a 17x17 window.
+
+    The window must lie in the mask, and the root mean square of the smoothed luminance's gradient in it must be below
+    FLAT_GRADIENT.
+    """
+    gradient = gradient_magnitude(blurred(luminance(truth)[None], FLAT_SIGMA)[0])
+    radius = FLAT_WINDOW // 2
+    square = F.avg_pool2d(gradient.square()[None, None], FLAT_WINDOW, 1, radius)[0, 0]
+    return eroded(mask, radius) & (square < FLAT_GRADIENT**2)
+
+
+def blurred(planes: Tensor, sigma: float) -> Tensor:
+    """Planes [N,H,W] under a Gaussian of standard deviation `sigma` in pixels; borders are mirrored."""
+    radius = math.ceil(4 * sigma)
+    offset = torch.arange(-radius, radius + 1, dtype=torch.float32, device=planes.device)
+    kernel = torch.exp(-offset.square() / (2 * sigma**2))
+    return _separable(planes, kernel / kernel.sum())
+
+
+def _halved(planes: Tensor) -> Tensor:
+    """The next level of the Gaussian pyramid (Burt & Adelson 1983): [N,H,W] -> [N,(H+1)//2,(W+1)//2]."""
+    kernel = planes.new_tensor([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
+    return _separable(planes, kernel)[:, ::2, ::2]
+
+
+def _separable(planes: Tensor, kernel: Tensor) -> Tensor:
+    radius = len(kernel) // 2
+    padded = F.pad(planes[:, None], (radius,) * 4, mode="reflect")
+    rows = F.conv2d(padded, kernel.view(1, 1, 1, -1))
+    return F.conv2d(rows, kernel.view(1, 1, -1, 1))[:, 0]

@@ -1,0 +1,1 @@
+"""Cameras and exposures, refined so that the photographs agree on the surface."""

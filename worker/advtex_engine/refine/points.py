@@ -1,0 +1,156 @@
+"""Surface points for camera refinement, and which view sees which of them.
+
+Points are spread over the mesh by area and drawn more often where the photographs have detail. All views share one
+order of preference, so that the few points that a view takes are largely those that its neighbors take too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from advtex_engine.core.cameras import project, scaled_camera
+from advtex_engine.core.scene import Camera, Mesh, View
+from advtex_engine.render.rasterize import rasterize_views
+from advtex_engine.render.view_maps import DEPTH_TOLERANCE
+
+CANDIDATES = 150_000
+EDGE_STEP = 0.04  # relative change of depth between neighboring pixels that counts as an edge
+EDGE_RADIUS = 3  # pixels around an edge whose color may belong to either side
+SURFACE_TOLERANCE = 0.01  # relative to depth: how far behind the rendered surface a point may lie and still be seen
+MIN_COSINE = 0.2  # between the surface's normal and the ray: beyond 78 degrees a pixel covers too much
+BORDER = 3.0  # pixels from the image's edge
+DETAIL_FLOOR = 0.1  # preference for a point without any detail, relative to the mean detail
+CELL_SIZE = 0.08  # of the median depth: about 25 of 320 pixels
+
+
+@dataclass(frozen=True)
+class Observations:
+    """V views and the up to K points that each looks at.
+
+    position: [P,3] float64 world metres. point: [V,K] int64, rows of `position` (0 where pad). seen: [V,K] bool, False
+    where pad.
+    """
+
+    position: Tensor
+    point: Tensor
+    seen: Tensor
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Surface points that at least two views see: position and normal [N,3] float64 (world), and detail [N] >= 0."""
+
+    position: Tensor
+    normal: Tensor
+    detail: Tensor
+
+
+def surface_depths(
+    mesh: Mesh, views: tuple[View, ...], size: tuple[int, int], kind: str
+) -> tuple[list[Camera], Tensor]:
+    """The cameras at `size` (width, height) and what they see of the mesh, [V,h,w] float32 metres.
+
+    0 where nothing is hit, near a depth edge, where the device's depth shows something else than the mesh, and where
+    the view's mask leaves a pixel out.
+    """
+    width, height = size
+    cameras = [scaled_camera(view.camera, width, height) for view in views]
+    depths = []
+    for view, fragments in zip(views, rasterize_views(mesh, cameras), strict=True):
+        depth = fragments.depth
+        keep = (fragments.face_index >= 0) & ~_near_edge(depth)
+        if view.depth is not None:
+            measured = F.interpolate(view.depth[None, None].to(depth.device), (height, width), mode="nearest")[0, 0]
+            keep &= (measured == 0) | ((measured - depth).abs() < DEPTH_TOLERANCE[kind])
+        if view.mask is not None:
+            used = view.mask[None, None].to(depth)
+            keep &= -F.adaptive_max_pool2d(-used, (height, width))[0, 0] > 0
+        depths.append(torch.where(keep, depth, 0.0))
+    return cameras, torch.stack(depths)
+
+
+def _near_edge(depth: Tensor) -> Tensor:
+    """[h,w] bool: within EDGE_RADIUS of a jump in depth or of the mesh's outline."""
+    padded = F.pad(depth[None, None], (1, 1, 1, 1), mode="replicate")
+    most = F.max_pool2d(padded, 3, stride=1)
+    least = -F.max_pool2d(-padded, 3, stride=1)
+    edge = (most - least > 2 * EDGE_STEP * most).to(torch.float32)
+    return F.max_pool2d(edge, 2 * EDGE_RADIUS + 1, stride=1, padding=EDGE_RADIUS)[0, 0] > 0
+
+
+def draw_candidates(
+    mesh: Mesh, cameras: list[Camera], depths: Tensor, detail: Tensor, generator: torch.Generator
+) -> Candidates:
+    """CANDIDATES points by area, without those that fewer than two views see.
+
+    depths: [V,h,w] of `surface_depths`. detail: [V,h,w] float32, the image's local contrast; a point's is the mean over
+    the views that see it. generator: on the CPU, so that every device draws the same.
+    """
+    device = mesh.v_pos.device
+    corners = mesh.v_pos.double().cpu()[mesh.t_pos_idx.cpu()]
+    normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = normal.norm(dim=1)
+    # Inverse of the cumulative area: torch.multinomial takes no more than 2^24 faces.
+    place = torch.rand(CANDIDATES, generator=generator, dtype=torch.float64) * area.sum()
+    face = torch.searchsorted(area.cumsum(0), place).clamp(max=len(area) - 1)
+    a, b = torch.rand(2, CANDIDATES, generator=generator, dtype=torch.float64)
+    root = a.sqrt()
+    weights = torch.stack((1 - root, root * (1 - b), root * b), 1)
+    position = (corners[face] * weights[..., None]).sum(1).to(device)
+    unit = (normal[face] / area[face].clamp(min=1e-30)[:, None]).to(device)
+    total = torch.zeros(CANDIDATES, dtype=torch.float64, device=device)
+    count = torch.zeros_like(total)
+    for view, (seen, pixel) in enumerate(_looks(position, unit, cameras, depths)):
+        total.index_add_(0, seen, detail[view].flatten()[pixel].double())
+        count[seen] += 1
+    shared = count >= 2
+    return Candidates(position[shared], unit[shared], total[shared] / count[shared])
+
+
+def observe(candidates: Candidates, chosen: Tensor, cameras: list[Camera], depths: Tensor, most: int) -> Observations:
+    """The first `most` of the candidates `chosen` ([M] int64, in order of preference) that each view sees."""
+    position, normal = candidates.position[chosen], candidates.normal[chosen]
+    device = position.device
+    point = torch.zeros((len(cameras), most), dtype=torch.int64, device=device)
+    seen = torch.zeros((len(cameras), most), dtype=torch.bool, device=device)
+    for view, (found, _) in enumerate(_looks(position, normal, cameras, depths)):
+        taken = found[:most]
+        point[view, : len(taken)] = taken
+        seen[view, : len(taken)] = True
+    return Observations(position, point, seen)
+
+
+def order_of_preference(candidates: Candidates, generator: torch.Generator) -> Tensor:
+    """[N] int64: a random order in which points with more detail tend to come first (weighted, no replacement)."""
+    weight = candidates.detail + DETAIL_FLOOR * candidates.detail.mean()
+    wait = torch.rand(len(weight), generator=generator, dtype=torch.float64).clamp(min=1e-12).log().neg()
+    return (wait.to(weight.device) / weight.clamp(min=1e-12)).argsort()
+
+
+def surface_cells(candidates: Candidates, depths: Tensor) -> Tensor:
+    """[N] int64: the cell of a grid in space, CELL_SIZE of the median of `depths` wide, that each point lies in."""
+    side = CELL_SIZE * depths[depths > 0].median().double()
+    cell: Tensor = torch.unique((candidates.position / side).floor().long(), dim=0, return_inverse=True)[1]
+    return cell
+
+
+def _looks(position: Tensor, normal: Tensor, cameras: list[Camera], depths: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Per view: the points [S] int64 that it sees, in order, and the pixels [S] (flat) where it sees them."""
+    height, width = depths.shape[1:]
+    for camera, depth in zip(cameras, depths, strict=True):
+        pixels, z = project(camera, position)
+        x, y = pixels.unbind(1)
+        inside = (z > 0) & (x > BORDER) & (x < width - BORDER) & (y > BORDER) & (y < height - BORDER)
+        near = inside.nonzero()[:, 0]
+        pixel = y[near].long() * width + x[near].long()
+        surface = depth.flatten()[pixel].double()
+        rotation = camera.world_to_camera[:3, :3].to(position)
+        ray = position[near] @ rotation.T + camera.world_to_camera[:3, 3].to(position)
+        cosine = ((normal[near] @ rotation.T) * ray).sum(1).abs() / ray.norm(dim=1)
+        seen = (surface > 0) & (z[near] < surface * (1 + SURFACE_TOLERANCE)) & (cosine > MIN_COSINE)
+        yield near[seen], pixel[seen]

@@ -1,0 +1,208 @@
+"""Rigid camera poses from photoconsistency (Zhou & Koltun 2014, "Color Map Optimization", section 3).
+
+Each view may move by a twist (rotation, translation) in its own camera frame; a Gauss-Newton step moves all at once
+(`refine_solve`). The value compared is the luminance with its local mean and contrast removed, so that exposure and
+white balance do not matter.
+Parameters are scaled to about a pixel: a twist of (1/f, 1/f, 1/f, z/f, z/f, z/f), z the view's median depth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from advtex_engine.refine.points import Observations
+from advtex_engine.refine.solve import Anchor, residuals, solve_views
+
+LEVELS = ((8, 6), (4, 6), (2, 5), (1, 4))  # shrink factor of the image, Gauss-Newton steps
+CONTRAST_RADIUS = 4  # pixels of the level around which local mean and contrast are taken
+CONTRAST_FLOOR = 0.04  # of the range: what is flatter than that counts less
+ROBUST_SCALE = 0.3  # residual, in local contrasts, at which an observation loses half of its weight
+ANCHOR = 0.1  # pull of each place towards where the given cameras show it on the average, relative to the evidence
+PRIOR = 0.001  # pull towards the given pose, relative to the mean strength of the evidence
+IMMOVABLE = 1e6
+LARGEST_STEP = 4.0  # pixels of the level
+
+
+@dataclass(frozen=True)
+class PointSamples:
+    """What V views see at their K points.
+
+    value: [V,K]. gradient: [V,K,2] of the value per pixel of the working size. pixel: [V,K,2]. local: [V,K,3] metres in
+    the camera's frame. valid: [V,K] bool, False where pad or outside of the image.
+    """
+
+    value: Tensor
+    gradient: Tensor
+    pixel: Tensor
+    local: Tensor
+    valid: Tensor
+
+
+def local_contrast(luminance: Tensor, scale: int) -> Tensor:
+    """[V,h,w] in [0,1] -> [V,3,h/scale,w/scale]: normalized value and its gradient per pixel of the full image."""
+    image = luminance[:, None]
+    height, width = image.shape[2:]
+    if scale > 1:
+        image = F.interpolate(image, (max(8, height // scale), max(8, width // scale)), mode="area")
+    image = _blurred(image, 1)
+    mean = _blurred(image, CONTRAST_RADIUS)
+    deviation = (_blurred(image.square(), CONTRAST_RADIUS) - mean.square()).clamp(min=0).sqrt()
+    value = (image - mean) / (deviation + CONTRAST_FLOOR)
+    padded = F.pad(value, (1, 1, 1, 1), mode="replicate")
+    across = (padded[:, :, 1:-1, 2:] - padded[:, :, 1:-1, :-2]) * (0.5 * image.shape[3] / width)
+    down = (padded[:, :, 2:, 1:-1] - padded[:, :, :-2, 1:-1]) * (0.5 * image.shape[2] / height)
+    return torch.cat((value, across, down), 1)
+
+
+def _blurred(image: Tensor, radius: int) -> Tensor:
+    """[V,1,h,w] smoothed by a Gaussian that is cut off at two standard deviations, `radius` pixels."""
+    offset = torch.arange(-radius, radius + 1, device=image.device, dtype=image.dtype)
+    kernel = torch.exp(-2 * (offset / radius).square())
+    kernel = kernel / kernel.sum()
+    padded = F.pad(image, (radius,) * 4, mode="replicate")
+    return F.conv2d(F.conv2d(padded, kernel.view(1, 1, 1, -1)), kernel.view(1, 1, -1, 1))
+
+
+def sample_points(
+    features: Tensor, K: Tensor, world_to_camera: Tensor, points: Observations, size: tuple[int, int]
+) -> PointSamples:
+    """Samples `local_contrast` where the views see their points; K [V,3,3] is for images of `size` (width, height)."""
+    world = points.position[points.point]
+    local = world @ world_to_camera[:, :3, :3].mT + world_to_camera[:, None, :3, 3]
+    z = local[..., 2].clamp(min=1e-6)
+    homogeneous = local @ K.mT
+    uv = (homogeneous[..., :2] / z[..., None]).float()
+    extent = uv.new_tensor(size)
+    valid = points.seen & (local[..., 2] > 1e-6) & ((uv > 1) & (uv < extent - 1)).all(-1)
+    found = F.grid_sample(features, (2 * uv / extent - 1)[:, :, None], padding_mode="border", align_corners=False)
+    value, across, down = found[..., 0].unbind(1)
+    return PointSamples(value, torch.stack((across, down), -1), uv, local.float(), valid)
+
+
+def refine_poses(
+    luminance: Tensor, K: Tensor, given: Tensor, points: Observations, spread: Observations | None = None
+) -> Tensor:
+    """world_to_camera [V,4,4] float64 that make the views agree; coarse to fine.
+
+    luminance: [V,h,w] float32 in [0,1]. K: [V,3,3] float64 for that size. points: those compared. spread: points all
+    over the surface, whose content is to stay where it is on the average; the mean motion of all cameras is removed
+    after each level but the finest: the mesh does not move with the cameras, so that they agree best where the mesh
+    is, and what they have in common beyond the anchor's pull is what the photographs insist on. Without, the first
+    view alone moves, and the others hold the gauge.
+    """
+    size = (luminance.shape[2], luminance.shape[1])
+    world_to_camera = given
+    for scale, steps in LEVELS:
+        features = local_contrast(luminance, scale)
+        for _ in range(steps):
+            samples = sample_points(features, K, world_to_camera, points, size)
+            residual, weight = residuals(samples.value, samples.valid, points, ROBUST_SCALE)
+            unit = _units(samples, K)
+            jacobian = pose_jacobian(samples, K) * unit[..., None]
+            strength = (jacobian.square() @ weight[..., None])[..., 0]
+            # A view without any point gets a prior alone and, its right side being 0, does not move.
+            prior = (PRIOR * strength.mean() + 1e-12).expand_as(strength).clone()
+            moved = twist(world_to_camera @ torch.linalg.inv(given)).float() / unit
+            anchor = None
+            if spread is None:
+                prior[1:] = IMMOVABLE * strength.max()
+            else:
+                held = sample_points(features, K, world_to_camera, spread, size)
+                anchor = _anchor(held, world_to_camera, unit, spread, float(strength.mean()))
+            step = solve_views(jacobian, residual, weight, points, prior, moved, anchor)
+            longest = step.norm(dim=1).clamp(min=1e-12)
+            step = step * (LARGEST_STEP * scale / longest).clamp(max=1)[:, None]
+            world_to_camera = exponential((step * unit).double()) @ world_to_camera
+        if spread is not None and scale > 1:
+            world_to_camera = keep_gauge(world_to_camera, given, points)
+    return world_to_camera
+
+
+def _units(samples: PointSamples, K: Tensor) -> Tensor:
+    """The twist [V,6] that each parameter stands for."""
+    focal = K[:, 0, 0].float()
+    depth = torch.where(samples.valid, samples.local[..., 2], torch.nan).nanmedian(1).values.nan_to_num(1.0)
+    return torch.stack((1 / focal,) * 3 + (depth / focal,) * 3, 1)
+
+
+def pose_jacobian(samples: PointSamples, K: Tensor) -> Tensor:
+    """Derivative [V,6,K] of the value with respect to the twist (rotation, translation) in the camera's frame."""
+    x, y, z = samples.local.unbind(-1)
+    inverse = 1 / z.clamp(min=1e-6)
+    a = samples.gradient[..., 0] * K[:, 0, 0, None].float() * inverse
+    b = samples.gradient[..., 1] * K[:, 1, 1, None].float() * inverse
+    c = -(a * x + b * y) * inverse
+    return torch.stack((y * c - z * b, z * a - x * c, x * b - y * a, a, b, c), 1)
+
+
+def _anchor(
+    samples: PointSamples, world_to_camera: Tensor, unit: Tensor, points: Observations, strength: float
+) -> Anchor:
+    """Holds the content of the surface where the given cameras show it on the average.
+
+    A camera's motion moves what it shows at a point by R^T (rotation x local + translation) in the world; across the
+    ray and divided by the distance that is an angle, times the focal length pixels.
+    """
+    local = samples.local
+    distance = local.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+    ray = local / distance
+    # Rows of (I - ray ray^T) [-[local]x, I] / distance, turned into the world.
+    identity = torch.eye(3, dtype=local.dtype, device=local.device)
+    across = (identity - ray[..., :, None] * ray[..., None, :]) / distance[..., None]
+    across = world_to_camera[:, None, :3, :3].mT.to(local.dtype) @ across
+    focal = 1 / unit[:, 0, None]
+    components = []
+    for axis in range(3):
+        row = across[:, :, axis]
+        whole = torch.cat((torch.linalg.cross(local, row), row), -1) * focal[..., None] * unit[:, None]
+        components.append(whole.mT.contiguous())
+    evidence = strength / samples.valid.sum(1).clamp(min=1).to(local.dtype).mean()
+    return Anchor(tuple(components), samples.valid * (ANCHOR * evidence), points)
+
+
+def keep_gauge(found: Tensor, given: Tensor, points: Observations) -> Tensor:
+    """Cameras [V,4,4] without their mean motion; those that see no points stay as they are.
+
+    Removed is the rigid motion of the world that takes what the new cameras see to where the given ones see it
+    (Kabsch), weighted by 1/z^2, so that it is pixels that count, and so that every camera counts the same.
+    """
+    world = points.position[points.point]
+    local = world @ given[:, :3, :3].mT + given[:, None, :3, 3]
+    moved = (local - found[:, None, :3, 3]) @ found[:, :3, :3]
+    weight = points.seen / local[..., 2].clamp(min=1e-6).square()
+    weight = weight / weight.sum(1, keepdim=True).clamp(min=1e-30)
+    weight = (weight / weight.sum().clamp(min=1e-30)).flatten()[:, None]
+    source, target = moved.flatten(0, 1), world.flatten(0, 1)
+    from_center, to_center = (source * weight).sum(0), (target * weight).sum(0)
+    u, _, vt = torch.linalg.svd((weight * (target - to_center)).T @ (source - from_center))
+    sign = torch.ones(3, dtype=u.dtype, device=u.device)
+    sign[2] = torch.linalg.det(u @ vt)
+    rotation = (u * sign) @ vt
+    back = torch.eye(4, dtype=u.dtype, device=u.device)
+    back[:3, :3] = rotation.T
+    back[:3, 3] = from_center - rotation.T @ to_center
+    return torch.where(points.seen.any(1)[:, None, None], found @ back, found)
+
+
+def exponential(twist: Tensor) -> Tensor:
+    """Rigid motions [V,4,4] of twists [V,6] (rotation, translation); translation is applied after the rotation."""
+    motion = torch.zeros((len(twist), 4, 4), dtype=twist.dtype, device=twist.device)
+    x, y, z = twist[:, :3].unbind(1)
+    zero = torch.zeros_like(x)
+    skew = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), 1).view(-1, 3, 3)
+    motion[:, :3, :3] = torch.linalg.matrix_exp(skew)
+    motion[:, :3, 3] = twist[:, 3:]
+    motion[:, 3, 3] = 1
+    return motion
+
+
+def twist(motion: Tensor) -> Tensor:
+    """Twists [V,6] of rigid motions [V,4,4] by less than a right angle; the inverse of `exponential`."""
+    skew = 0.5 * (motion[:, :3, :3] - motion[:, :3, :3].mT)
+    axis = torch.stack((skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]), 1)
+    sine = axis.norm(dim=1, keepdim=True).clamp(min=1e-12)
+    return torch.cat((axis * (sine.clamp(max=1).asin() / sine), motion[:, :3, 3]), 1)

@@ -1,0 +1,117 @@
+"""What refinement looks at: images at its working size, and surface points to fit, to hold on to, and to check."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from advtex_engine.core.cameras import stack_cameras
+from advtex_engine.core.scene import Mesh, View
+from advtex_engine.refine.points import (
+    Observations,
+    draw_candidates,
+    observe,
+    order_of_preference,
+    surface_cells,
+    surface_depths,
+)
+from advtex_engine.refine.pose import local_contrast
+
+WORKING_WIDTH = 320  # pixels; finer images take longer and gain little
+POINTS_PER_VIEW = 5000
+CHECKED_SHARE = 0.2  # of the surface is set aside to judge the result
+CHECKED_PER_VIEW = 1500
+SPREAD_STRIDE = 16  # every so many of the points hold the content in place
+MIN_CANDIDATES = 1000  # points of the drawn ones that two views must see, to refine anything
+CONTRAST_SCALE = 0.5  # disagreements of `features` beyond twice that are occlusions or highlights
+LUMINANCE = (0.299, 0.587, 0.114)
+
+
+@dataclass(frozen=True)
+class WorkingViews:
+    """V views at the working size.
+
+    color: [V,3,h,w] float32 in [0,1]. features: `local_contrast` at full resolution. K [V,3,3], given [V,4,4]: float64.
+    checked_cell: `surface_cells` of the points to check.
+    """
+
+    color: Tensor
+    features: Tensor
+    K: Tensor
+    given: Tensor
+    fitted: Observations
+    spread: Observations
+    checked: Observations
+    checked_cell: Tensor
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.color.shape[3], self.color.shape[2]
+
+    @property
+    def luminance(self) -> Tensor:
+        """[V,h,w] float32 in [0,1]."""
+        return luminance(self.color)
+
+
+def working_views(
+    mesh: Mesh, views: tuple[View, ...], kind: str, device: torch.device, seed: int
+) -> WorkingViews | None:
+    """None when hardly anything is seen by two views."""
+    generator = torch.Generator().manual_seed(seed)
+    mesh = Mesh(mesh.v_pos.to(device), mesh.t_pos_idx.to(device))
+    camera = views[0].camera
+    width = min(WORKING_WIDTH, camera.width)
+    size = (width, max(1, round(camera.height * width / camera.width)))
+    color = torch.cat([_shrunk(view.color.to(device), size) for view in views])
+    features = local_contrast(luminance(color), 1)
+    cameras, depths = surface_depths(mesh, views, size, kind)
+    K, given = stack_cameras(cameras, device)
+    candidates = draw_candidates(mesh, cameras, depths, features[:, 1:].norm(dim=1), generator)
+    if len(candidates.position) < MIN_CANDIDATES:
+        return None
+    order = order_of_preference(candidates, generator)
+    cell = surface_cells(candidates, depths)[order]
+    aside = (torch.rand(int(cell.max()) + 1, generator=generator) < CHECKED_SHARE).to(device)[cell]
+    checked = observe(candidates, order[aside], cameras, depths, CHECKED_PER_VIEW)
+    fitted = observe(candidates, order[~aside], cameras, depths, POINTS_PER_VIEW)
+    spread = observe(candidates, order[::SPREAD_STRIDE], cameras, depths, POINTS_PER_VIEW // 4)
+    return WorkingViews(color, features, K, given, fitted, spread, checked, cell[aside])
+
+
+def luminance(color: Tensor) -> Tensor:
+    """[V,3,h,w] -> [V,h,w]."""
+    return (color * color.new_tensor(LUMINANCE)[:, None, None]).sum(1)
+
+
+def motion(found: Tensor, working: WorkingViews) -> Tensor:
+    """[V,3] float64 on the CPU: millimetres and degrees that each camera moved from the given pose to `found` [V,4,4].
+
+    And the median pixels of the working size that its content did.
+    """
+    given, K, points = working.given, working.K, working.fitted
+    change = found @ torch.linalg.inv(given)
+    centers = [-(pose[:, :3, :3].mT @ pose[:, :3, 3:])[..., 0] for pose in (found, given)]
+    # The angle's sine and cosine, since a small angle's cosine alone has lost it.
+    rotation = change[:, :3, :3]
+    skew = rotation - rotation.mT
+    sine = 0.5 * torch.stack((skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]), 1).norm(dim=1)
+    cosine = 0.5 * (rotation.diagonal(dim1=1, dim2=2).sum(1) - 1)
+    world = points.position[points.point]
+    pixels = []
+    for pose in (found, given):
+        homogeneous = (world @ pose[:, :3, :3].mT + pose[:, None, :3, 3]) @ K.mT
+        pixels.append(homogeneous[..., :2] / homogeneous[..., 2:])
+    shift = torch.where(points.seen, (pixels[0] - pixels[1]).norm(dim=-1), torch.nan).nanmedian(1).values
+    millimetres = 1000 * (centers[0] - centers[1]).norm(dim=1)
+    return torch.stack((millimetres, torch.atan2(sine, cosine).rad2deg(), shift), 1).cpu()
+
+
+def _shrunk(color: Tensor, size: tuple[int, int]) -> Tensor:
+    """[H,W,3] uint8 -> [1,3,h,w] float32 in [0,1], averaged over areas."""
+    image = color.permute(2, 0, 1)[None].to(torch.float32) / 255
+    return F.interpolate(image, (size[1], size[0]), mode="area")

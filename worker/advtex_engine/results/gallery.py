@@ -1,0 +1,212 @@
+"""The pictures of a result, in its folder `previews/`.
+
+comparison.png, sheet.png    photograph | textured render | projected mean of one view, and of a few
+views/NNNN_photo.jpg, NNNN_render.jpg, NNNN_mean.jpg      the same of up to MAX_VIEWS views, at the same size
+turntable/NN.jpg             the model from all around
+atlas_N.jpg                  the texture's pages
+thumbnail.jpg                a good view of the model, square
+curves.json                  see `curves.py`
+manifest.json                lists all but the first two; its paths are relative to the result's folder
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from advtex_engine.core.scene import Atlas, Scene, View, evenly_spread
+from advtex_engine.render.pictures import contact_sheet, encode_jpeg, side_by_side, to_bytes
+from advtex_engine.render.render_view import GBuffer, gbuffer, gbuffers, shade
+from advtex_engine.results.initial_view import orbit
+from advtex_engine.results.turntable import SIZE, Circle, circle_cameras, facing, find_circle, turntable
+from advtex_engine.runtime.files import write_atomically
+from advtex_engine.runtime.threads import in_threads, one_thread_each
+
+COMPARISON, SHEET = "comparison.png", "sheet.png"
+MAX_VIEWS = 12
+SHEET_VIEWS = 6
+LONGEST_SIDE = 1280
+ATLAS_SIDE = 2048
+THUMBNAIL = 256
+TURNTABLE_TEXTURE = 1024
+"""Texels of the texture that pictures of the whole model are painted with: finer ones would flicker in them."""
+
+Image = NDArray[np.uint8]
+
+
+def write_gallery(
+    out: Path, scene: Scene, atlas: Atlas, texture: Tensor, mean: Tensor, curves: Mapping[str, Any]
+) -> tuple[Path, ...]:
+    """Writes all pictures below `out`/previews; -> their paths, the manifest last.
+
+    texture, mean: [atlas.height,atlas.width,3] float sRGB in [0,1] on the device of the atlas's mesh, which renders.
+    curves: see `curves.py`. Pictures are encoded and written in a few threads while the next ones are rendered.
+    """
+    with one_thread_each():
+        return _write_pictures(_Gallery(out), scene, atlas, texture, mean, curves)
+
+
+def _write_pictures(
+    gallery: _Gallery, scene: Scene, atlas: Atlas, texture: Tensor, mean: Tensor, curves: Mapping[str, Any]
+) -> tuple[Path, ...]:
+    renders = list[tuple[float, Image]]()
+    gallery.save_all(_view_pictures(gallery, scene, atlas, texture, mean, renders))
+    gallery.files += (gallery.folder / COMPARISON, gallery.folder / SHEET)
+    circle = find_circle(atlas.mesh, scene.views, scene.up_axis)
+    coarse = _coarse(texture)
+    # Textures made of smaller pictures than the turntable's have no detail that finer samples would show.
+    supersample = 2 if scene.views[0].camera.width >= SIZE[0] else 1
+    buffers = enumerate(turntable(atlas, circle, supersample))
+    gallery.turntable = gallery.save_all(
+        (f"turntable/{frame:02d}.jpg", _shaded(buffer, coarse)) for frame, buffer in buffers
+    )
+    pages = enumerate(_pages(texture, atlas.pages))
+    atlases = gallery.save_all((f"atlas_{number}.jpg", page) for number, page in pages)
+    (thumbnail,) = gallery.save_all([("thumbnail.jpg", _thumbnail(atlas, circle, coarse, renders))])
+    manifest = {
+        "views": gallery.views,
+        "turntable": gallery.turntable,
+        "orbit": orbit(circle, scene.up_axis),
+        "thumbnail": thumbnail,
+        "atlas": atlases,
+        "curves": gallery.write("curves.json", _json(curves)),
+    }
+    gallery.write("manifest.json", _json(manifest))
+    return tuple(gallery.files)
+
+
+def chosen_views(scene: Scene) -> list[tuple[View, bool]]:
+    """Up to MAX_VIEWS views from all over the capture, by name, and whether each was held out; of those up to half."""
+    heldout = evenly_spread(scene.heldout, MAX_VIEWS // 2)
+    training = evenly_spread(scene.views, MAX_VIEWS - len(heldout))
+    chosen = [(view, True) for view in heldout] + [(view, False) for view in training]
+    return sorted(chosen, key=lambda pair: pair[0].name)
+
+
+class _Gallery:
+    """The files written so far, and the manifest's lists."""
+
+    def __init__(self, out: Path) -> None:
+        self.out = out
+        self.folder = out / "previews"
+        self.files: list[Path] = []
+        self.views: list[dict[str, Any]] = []
+        self.turntable: list[str] = []
+
+    def save_all(self, pictures: Iterable[tuple[str, Image]]) -> list[str]:
+        """Writes JPEGs. -> their paths as the manifest has them."""
+        return [self._wrote(path) for path in in_threads(lambda picture: self._save(*picture), pictures)]
+
+    def write(self, name: str, data: bytes) -> str:
+        return self._wrote(self._put(name, data))
+
+    def listed(self, name: str) -> str:
+        """The path of a file as the manifest has it."""
+        return (self.folder / name).relative_to(self.out).as_posix()
+
+    def _save(self, name: str, picture: Image) -> Path:
+        return self._put(name, encode_jpeg(picture))
+
+    def _put(self, name: str, data: bytes) -> Path:
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, data)
+        return path
+
+    def _wrote(self, path: Path) -> str:
+        self.files.append(path)
+        return path.relative_to(self.out).as_posix()
+
+
+def _view_pictures(
+    gallery: _Gallery,
+    scene: Scene,
+    atlas: Atlas,
+    texture: Tensor,
+    mean: Tensor,
+    renders: list[tuple[float, Image]],
+) -> Iterator[tuple[str, Image]]:
+    """Photograph, render and mean of the chosen views; then writes comparison.png and sheet.png.
+
+    renders: takes, per view, the share of it that shows the model, and its render.
+    """
+    chosen = chosen_views(scene)
+    shown = evenly_spread([view for view, heldout in chosen if heldout or not scene.heldout], SHEET_VIEWS)
+    rows = list[list[Tensor]]()
+    buffers = gbuffers(atlas, [view.camera for view, _ in chosen])
+    for number, ((view, heldout), buffer) in enumerate(zip(chosen, buffers, strict=True)):
+        pictures = [shade(buffer, candidate) for candidate in (texture, mean)]
+        if any(view is other for other in shown):
+            rows.append(pictures)
+        images = [_reduced(image, LONGEST_SIDE) for image in (view.color.numpy(), *map(to_bytes, pictures))]
+        height, width, _ = images[0].shape
+        entry: dict[str, Any] = {"name": view.name, "heldout": heldout, "width": width, "height": height}
+        for kind, image in zip(("photo", "render", "mean"), images, strict=True):
+            name = f"views/{number:04d}_{kind}.jpg"
+            entry[kind] = gallery.listed(name)
+            yield name, image
+        gallery.views.append(entry)
+        renders.append((buffer.coverage, images[1]))
+    middle = len(shown) // 2
+    rendered, averaged = rows[middle]
+    gallery.folder.mkdir(parents=True, exist_ok=True)
+    side_by_side(shown[middle], rendered, averaged, gallery.folder / COMPARISON)
+    contact_sheet(shown, rows, ("advtex", "projected mean"), gallery.folder / SHEET)
+
+
+def _thumbnail(atlas: Atlas, circle: Circle, coarse: Tensor, renders: Sequence[tuple[float, Image]]) -> Image:
+    """The view of a room that shows most of it and has most to show, else the model from the scan's side."""
+    if not circle.inside:
+        camera = circle_cameras(circle, (THUMBNAIL, THUMBNAIL))[0]
+        return to_bytes(shade(gbuffer(facing(atlas, camera, circle.outer), camera), coarse))
+    _, best = max(renders, key=lambda render: render[0] * float(render[1].std()))
+    return _square(best)
+
+
+def _square(image: Image) -> Image:
+    """The middle of it, THUMBNAIL pixels a side."""
+    side = min(image.shape[:2])
+    top, left = ((length - side) // 2 for length in image.shape[:2])
+    middle = image[top : top + side, left : left + side]
+    return np.asarray(cv2.resize(middle, (THUMBNAIL, THUMBNAIL), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _coarse(texture: Tensor) -> Tensor:
+    """The texture averaged over blocks until it has about TURNTABLE_TEXTURE texels a side."""
+    return torch.from_numpy(_reduced(texture.cpu().numpy(), TURNTABLE_TEXTURE)).to(texture.device)
+
+
+def _shaded(buffer: GBuffer, texture: Tensor) -> Image:
+    return to_bytes(shade(buffer, texture))
+
+
+def _pages(texture: Tensor, count: int) -> Iterator[Image]:
+    height, width = texture.shape[0] // count, texture.shape[1] // count
+    for row in range(count):
+        for column in range(count):
+            page = texture[row * height : (row + 1) * height, column * width : (column + 1) * width]
+            # Made smaller first: a page's bytes and their temporaries would take as much memory as the texture.
+            yield to_bytes(torch.from_numpy(_reduced(page.cpu().numpy(), ATLAS_SIDE)))
+
+
+def _reduced(pixels: NDArray[Any], longest: int) -> NDArray[Any]:
+    """The pixels themselves, or averaged to fewer where a side is longer than `longest`."""
+    height, width, _ = pixels.shape
+    scale = longest / max(height, width)
+    if scale >= 1:
+        return pixels
+    return cv2.resize(
+        pixels, (max(1, round(width * scale)), max(1, round(height * scale))), interpolation=cv2.INTER_AREA
+    )
+
+
+def _json(value: object) -> bytes:
+    return json.dumps(value, allow_nan=False).encode() + b"\n"

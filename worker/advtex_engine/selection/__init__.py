@@ -1,0 +1,1 @@
+"""One photograph per face: candidates, labels, leveled seams, detail projected back."""

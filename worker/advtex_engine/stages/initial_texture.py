@@ -1,0 +1,52 @@
+"""What the method begins with: mean textures, and for the adversarial ones the preset's start and tones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from torch import Tensor
+
+from advtex_engine.budget.limits import Budget
+from advtex_engine.budget.workload import Workload
+from advtex_engine.core.scene import Atlas, Scene
+from advtex_engine.methods import MethodInput
+from advtex_engine.methods.adversarial import starting_texture
+from advtex_engine.methods.mean import mean_texture
+from advtex_engine.methods.view_selection import select_views
+from advtex_engine.render.view_maps import ViewMaps
+from advtex_engine.results.live import Live
+from advtex_engine.runtime.stage_records import Stages
+from advtex_engine.selection.toning import tone_views
+
+
+def method_input(
+    scene: Scene, atlas: Atlas, maps: Mapping[int, ViewMaps], work: Workload, budget: Budget, stages: Stages
+) -> MethodInput:
+    """All that the method is given, within the budget's limits."""
+    config, monitor = budget.config, stages.monitor
+    preset = budget.preset(work.preset)
+    with stages.run("initial_texture"):
+        means = {scale: mean_texture(level) for scale, level in maps.items()}
+        live = Live(scene, atlas, monitor)
+        given = MethodInput(scene, atlas, maps, means, preset, config, monitor, budget.texture_folder(), live)
+        given = replace(given, on_device=budget.limits.on_device)
+        if config.method.startswith("adversarial"):
+            if preset.start == "selection":
+                given = replace(given, start=_selected_start(given))
+            if preset.toned:
+                for level in maps.values():
+                    tone_views(level, starting_texture(given))
+    stages.save()
+    return given
+
+
+def _selected_start(given: MethodInput) -> Tensor:
+    """The texture by view selection; from the work folder when it is there."""
+    saved = given.work.load("initial_texture", ("texture",))
+    if saved is not None:
+        texture: Tensor = saved["texture"].to(given.means[1])
+        return texture
+    texture = select_views(given).texture
+    given.work.save("initial_texture", {"texture": texture})
+    return texture

@@ -1,0 +1,1 @@
+"""Scans of drawn objects, whose truth is known."""

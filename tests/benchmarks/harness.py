@@ -39,13 +39,13 @@ from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.view_selection import select_views
 from advtex_engine.metrics.evaluate import PATCH_METRICS, VIEW_METRICS, Comparison, evaluate, score
 from advtex_engine.metrics.lpips import Lpips, WeightsError, load_lpips
+from advtex_engine.previews.live import Live
 from advtex_engine.refine.run import apply_refinement, refine_cameras
 from advtex_engine.render.pictures import contact_sheet
 from advtex_engine.render.render_view import render_layers, render_view
 from advtex_engine.render.texture import fill_holes
 from advtex_engine.render.view_maps import build_view_maps
 from advtex_engine.results.export import export_model
-from advtex_engine.results.live import Live
 from advtex_engine.runtime.checkpoint import WorkFolder
 from advtex_engine.runtime.files import write_atomically
 from advtex_engine.selection.toning import tone_views

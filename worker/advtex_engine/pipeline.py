@@ -19,11 +19,11 @@ from advtex_engine.core import Diverged, Monitor, TextureConfig, WarningKeeper
 from advtex_engine.ingest import FrameStore, read_capture
 from advtex_engine.mesh import MAX_FRAMES, fuse, register_mesh
 from advtex_engine.methods import METHODS, require
-from advtex_engine.metrics import speckle_share
+from advtex_engine.metrics.speckle import speckle_share
+from advtex_engine.previews.curves import curves
 from advtex_engine.render import fill_holes
 from advtex_engine.results import (
     assembled,
-    curves,
     describe_scene,
     export_model,
     heldout_scores,

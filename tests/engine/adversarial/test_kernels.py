@@ -364,7 +364,7 @@ COMPILE = """
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from advtex_engine import kernels, kernels_losses, kernels_offsets
+from advtex_engine.adversarial import kernels, kernels_losses, kernels_offsets
 
 TYPES = {
     "choose": "fp32 i64 i64 i64 i64 i64",

@@ -40,12 +40,12 @@ BY_LIBRARIES = {"decode", "atlas", "export"}
 BARE = ("torch", "torchgen", "functorch", "numpy", "numpy.libs", "typing_extensions.py", "sympy", "mpmath", "networkx")
 BARE_TOO = ("filelock", "fsspec", "jinja2", "markupsafe")
 SHORT = """
-from advtex_engine import bench, bench_limits, bench_stages
+from advtex_engine.bench import limits, run, stages
 
-bench.WARMUP, bench.STEPS, bench_limits.FIRST_SIDE, bench_stages.PICTURES = 1, 1, 64, 1
-bench_limits.LONG_ENOUGH = 0.0
-bench_limits.COPIED_BYTES["cpu"] = 1 << 20
-raise SystemExit(bench.main())
+run.WARMUP, run.STEPS, limits.FIRST_SIDE, stages.PICTURES = 1, 1, 64, 1
+limits.LONG_ENOUGH = 0.0
+limits.COPIED_BYTES["cpu"] = 1 << 20
+raise SystemExit(run.main())
 """
 
 
@@ -122,7 +122,7 @@ def test_torch_and_numpy_are_enough(tmp_path: Path) -> None:
     for name in (*BARE, *BARE_TOO):
         if (installed / name).exists():
             (tmp_path / name).symlink_to(installed / name)
-    path = os.pathsep.join((str(Path(bench_module.__file__).parents[1]), str(tmp_path)))
+    path = os.pathsep.join((str(Path(bench_module.__file__).parents[2]), str(tmp_path)))
     done = subprocess.run(
         [sys.executable, "-S", "-c", SHORT, *SMALL[1:], "--json"],
         env={**os.environ, "PYTHONPATH": path},

@@ -101,7 +101,7 @@ def test_the_estimate_of_steps_is_what_they_take(
 RUN = """
 import json, sys
 from pathlib import Path
-from advtex_engine.config import TextureConfig
+from advtex_engine.core.config import TextureConfig
 from advtex_engine.pipeline import texture_scan
 scan, folder, preset = sys.argv[1:]
 config = TextureConfig(preset=preset, steps=8, device="cpu")

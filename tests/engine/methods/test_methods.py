@@ -28,12 +28,12 @@ from advtex_engine.methods.sharpest import sharpness
 from advtex_engine.methods.vgg import WEIGHTS_VARIABLE, load_vgg
 from advtex_engine.metrics.lpips import NETWORKS, WeightsError, load_features
 from advtex_engine.pipeline import texture_scan
+from advtex_engine.previews.live import Live
 from advtex_engine.render.pairs import own_pairs
 from advtex_engine.render.rasterize import rasterize
 from advtex_engine.render.render_view import render_view
 from advtex_engine.render.texels import map_texels
 from advtex_engine.render.view_maps import build_view_maps
-from advtex_engine.results.live import Live
 from advtex_engine.runtime.checkpoint import WorkFolder
 from advtex_engine.synthetic.object import look_at
 from advtex_engine.synthetic.planar import planar_maps

@@ -18,6 +18,7 @@ from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Atlas, Camera, Mesh, Scene, View
 from advtex_engine.methods import METHODS, MethodInput
 from advtex_engine.methods.mean import mean_texture
+from advtex_engine.previews.live import Live
 from advtex_engine.refine.points import Observations
 from advtex_engine.refine.pose import sample_points
 from advtex_engine.refine.run import apply_refinement, refine_cameras
@@ -26,7 +27,6 @@ from advtex_engine.refine.working_views import working_views
 from advtex_engine.render.rasterize import rasterize
 from advtex_engine.render.texture import bilinear_footprint
 from advtex_engine.render.view_maps import build_view_maps
-from advtex_engine.results.live import Live
 from advtex_engine.runtime.checkpoint import WorkFolder
 
 VIEWS = 8

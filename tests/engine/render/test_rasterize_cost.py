@@ -14,8 +14,8 @@ ROOT = Path(__file__).parents[3]
 
 MEMORY = """
 import json, resource, sys, torch
-from advtex_engine.rasterize import rasterize
-from advtex_engine.scene import Camera, Mesh
+from advtex_engine.render.rasterize import rasterize
+from advtex_engine.core.scene import Camera, Mesh
 K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
 camera = Camera(K, torch.eye(4, dtype=torch.float64), 640, 480)
 if sys.argv[1] == "fine":

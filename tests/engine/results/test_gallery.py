@@ -31,16 +31,16 @@ from advtex_engine.core.config import PRESETS, Preset
 from advtex_engine.core.monitor import Glimpse, Monitor
 from advtex_engine.core.scene import TO_Y_UP, Atlas, Camera, Mesh, Scene, View
 from advtex_engine.ingest.shrink import shrink
+from advtex_engine.previews import live as live_module
+from advtex_engine.previews.curves import MAX_POINTS, curves
+from advtex_engine.previews.live import Live
+from advtex_engine.previews.turntable import camera_at, circle_cameras, facing, find_circle
 from advtex_engine.render.pairs import related_pairs
 from advtex_engine.render.render_view import render_view
 from advtex_engine.render.view_maps import ViewMaps, build_view_maps
-from advtex_engine.results import live as live_module
-from advtex_engine.results.curves import MAX_POINTS, curves
 from advtex_engine.results.gallery import MAX_VIEWS, chosen_views, write_gallery
 from advtex_engine.results.initial_view import orbit
-from advtex_engine.results.live import Live
 from advtex_engine.results.result_page import embedded, write_page
-from advtex_engine.results.turntable import camera_at, circle_cameras, facing, find_circle
 
 HOSTILE = "</script><script>document.title='taken'</script>&lt;img src=x onerror=alert(1)>\u2028.png"
 SIDE = 64

@@ -19,9 +19,9 @@ from advtex_engine.methods import METHODS, MethodInput
 from advtex_engine.methods.view_selection import Selection, select_views, view_selection
 from advtex_engine.metrics.image_metrics import gradient_ratio
 from advtex_engine.pipeline import texture_scan
+from advtex_engine.previews.live import Live
 from advtex_engine.render.render_view import render_layers, render_view
 from advtex_engine.render.view_maps import build_view_maps
-from advtex_engine.results.live import Live
 from advtex_engine.runtime.checkpoint import WorkFolder
 
 DATA = Path(os.environ.get("ADVTEX_DATA", Path(__file__).parents[3] / "../shared/data"))

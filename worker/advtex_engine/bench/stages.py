@@ -26,12 +26,12 @@ from advtex_engine.core.scene import Atlas, Mesh, Scene
 from advtex_engine.methods.inputs import MethodInput
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.view_selection import select_views
+from advtex_engine.previews.live import Live
+from advtex_engine.previews.turntable import FRAMES, SIZE, circle_cameras, facing, find_circle
 from advtex_engine.render.pairs import Pairs, related_pairs
 from advtex_engine.render.render_view import gbuffer, shade
 from advtex_engine.render.texture import fill_holes
 from advtex_engine.render.view_maps import ViewMaps, build_view_maps
-from advtex_engine.results.live import Live
-from advtex_engine.results.turntable import FRAMES, SIZE, circle_cameras, facing, find_circle
 from advtex_engine.runtime.checkpoint import WorkFolder
 from advtex_engine.runtime.devices import wait_for
 from advtex_engine.runtime.threads import in_threads

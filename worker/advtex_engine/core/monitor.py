@@ -29,7 +29,7 @@ STAGES = (
 class Glimpse:
     """The texture as it is after `step`: small JPEGs of the model by file name, and the curves so far.
 
-    titles: the view's name for each of the pictures. curves: as `results/curves.py` gives them.
+    titles: the view's name for each of the pictures. curves: as `previews/curves.py` gives them.
     """
 
     step: int

@@ -11,8 +11,8 @@ from torch import Tensor
 from advtex_engine.core.config import Preset, TextureConfig
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Atlas, Scene
+from advtex_engine.previews.live import Live
 from advtex_engine.render.view_maps import ViewMaps, held_bytes
-from advtex_engine.results.live import Live
 from advtex_engine.runtime.checkpoint import WorkFolder
 
 LossPoint = dict[str, Any]

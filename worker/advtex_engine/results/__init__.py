@@ -1,6 +1,5 @@
 """What a run leaves: the model, pictures, curves, a page and a report."""
 
-from advtex_engine.results.curves import curves
 from advtex_engine.results.export import export_model
 from advtex_engine.results.gallery import write_gallery
 from advtex_engine.results.report import assembled, describe_scene, heldout_scores, write_report
@@ -8,7 +7,6 @@ from advtex_engine.results.result_page import write_page
 
 __all__ = [
     "assembled",
-    "curves",
     "describe_scene",
     "export_model",
     "heldout_scores",

@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from advtex_engine.core.scene import Atlas, Scene, View, evenly_spread
+from advtex_engine.previews.turntable import SIZE, Circle, circle_cameras, facing, find_circle, turntable
 from advtex_engine.render.pictures import contact_sheet, encode_jpeg, side_by_side, to_bytes
 from advtex_engine.render.render_view import GBuffer, gbuffer, gbuffers, shade
 from advtex_engine.results.initial_view import orbit
-from advtex_engine.results.turntable import SIZE, Circle, circle_cameras, facing, find_circle, turntable
 from advtex_engine.runtime.files import write_atomically
 from advtex_engine.runtime.threads import in_threads, one_thread_each
 

@@ -9,7 +9,7 @@ import torch
 
 from advtex_engine.core.cameras import camera_center
 from advtex_engine.core.scene import TO_Y_UP
-from advtex_engine.results.turntable import FIELD_OF_VIEW, SIZE, Circle, circle_cameras
+from advtex_engine.previews.turntable import FIELD_OF_VIEW, SIZE, Circle, circle_cameras
 from advtex_scan.matrices import from_quaternion
 
 

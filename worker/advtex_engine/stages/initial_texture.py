@@ -14,8 +14,8 @@ from advtex_engine.methods import MethodInput
 from advtex_engine.methods.adversarial import starting_texture
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.view_selection import select_views
+from advtex_engine.previews.live import Live
 from advtex_engine.render.view_maps import ViewMaps
-from advtex_engine.results.live import Live
 from advtex_engine.runtime.stage_records import Stages
 from advtex_engine.selection.toning import tone_views
 

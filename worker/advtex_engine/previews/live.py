@@ -17,12 +17,12 @@ from torch import Tensor
 from advtex_engine.core.monitor import Glimpse, Monitor
 from advtex_engine.core.scene import Atlas, Camera, Scene, View, evenly_spread
 from advtex_engine.metrics.image_metrics import gradient_ratio, psnr
+from advtex_engine.previews.curves import curves
 from advtex_engine.render.pictures import encode_jpeg, to_bytes
 from advtex_engine.render.rasterize import rasterize
 from advtex_engine.render.render_view import BACKGROUND
 from advtex_engine.render.texture import bilinear_footprint, sample_texels
 from advtex_engine.render.view_maps import DEPTH_TOLERANCE, ViewMaps
-from advtex_engine.results.curves import curves
 from advtex_engine.runtime.threads import one_thread_each
 
 SECONDS = 5.0

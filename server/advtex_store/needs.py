@@ -12,6 +12,7 @@ from advtex_contract.options import JobOptions, Preset
 GIB = 1 << 30
 BASE = GIB  # libraries, mesh, discriminator
 PER_VIEW_PIXEL = 9  # color, uv and depth of every view stay on the device
+COARSE_TOO = 1.25  # the preset preview keeps views of half the size beside them
 TEXELS_PER_VIEW_PIXEL = 0.5  # views overlap: 0.13 to 0.38 were measured
 # Value, gradient, two moments, average and start, in float32; and the whole image with its holes being filled.
 PER_TEXEL = 200
@@ -39,6 +40,7 @@ def needed_memory(options: JobOptions, views: int, width: int, height: int, *, f
     texels = min(options.max_texture_size**2, int(view_pixels * TEXELS_PER_VIEW_PIXEL))
     step_pixels = min(pixels, STANDARD_STEP_PIXELS) if options.preset is Preset.standard else pixels
     scored = pixels * PER_SCORED_PIXEL if options.holdout else 0
-    textured = view_pixels * PER_VIEW_PIXEL + texels * PER_TEXEL + step_pixels * PER_STEP_PIXEL + scored
+    view_bytes = int(view_pixels * PER_VIEW_PIXEL * (COARSE_TOO if options.preset is Preset.preview else 1))
+    textured = view_bytes + texels * PER_TEXEL + step_pixels * PER_STEP_PIXEL + scored
     fused = min(views * PER_FUSED_FRAME, MAX_FUSED) if fuses else 0
     return BASE + max(textured, fused)

@@ -21,9 +21,9 @@ from advtex_contract.options import JobOptions
 from advtex_contract.options import Preset as Presets
 from advtex_engine.adversarial.discriminator import PatchDiscriminator
 from advtex_engine.adversarial.optimizer import AdversarialOptimizer
-from advtex_engine.budget.workload import Workload, estimate, tensor_bytes
+from advtex_engine.budget.workload import PARAMETERS, Workload, activations, estimate, tensor_bytes
 from advtex_engine.core.config import PRESETS, Preset
-from advtex_engine.render.view_maps import ViewMaps
+from advtex_engine.render.view_maps import ViewMaps, held_bytes
 from advtex_engine.runtime import available_memory as memory
 from advtex_engine.runtime.available_memory import available_memory
 from advtex_engine.runtime.shortage import memory_problem
@@ -145,7 +145,7 @@ def test_views_count_nine_bytes_a_pixel_and_only_those_that_are_there() -> None:
     maps, _ = planar_views(7, 64, 48, 1.0, CPU)
     work = workload(maps, PRESETS["standard"])
     stored = sum(part.nbytes for part in (maps.color, maps.uv, maps.depth))
-    assert estimate(work)["view_maps"] == stored == memory.held_bytes([maps], CPU) - maps.slot_map.nbytes
+    assert estimate(work)["view_maps"] == stored == held_bytes([maps], CPU) - maps.slot_map.nbytes
     assert estimate(work, 3)["view_maps"] == stored * 3 // 7
     assert estimate(work)["slot_maps"] == maps.slot_map.nbytes
     assert estimate(workload(maps, PRESETS["preview"]))["view_maps"] == stored * 5 // 4
@@ -154,10 +154,10 @@ def test_views_count_nine_bytes_a_pixel_and_only_those_that_are_there() -> None:
 
 def test_the_layers_are_those_of_the_network() -> None:
     network = PatchDiscriminator()
-    assert sum(parameter.numel() for parameter in network.parameters()) == memory.PARAMETERS
+    assert sum(parameter.numel() for parameter in network.parameters()) == PARAMETERS
     logits, features = network.examine(torch.zeros((1, 6, 96, 72)).contiguous(memory_format=torch.channels_last))
     sizes = [2 * layer.nbytes for layer in features] + [logits.nbytes]
-    assert memory.activations(72, 96, 4) == sizes
+    assert activations(72, 96, 4) == sizes
 
 
 @settings(max_examples=60, deadline=None)

@@ -12,7 +12,7 @@ from advtex_engine.core.cameras import project, unproject
 from advtex_engine.core.scene import Atlas, Camera, Mesh, View
 from advtex_engine.ingest.shrink import shrink
 from advtex_engine.refine.points import surface_depths
-from advtex_engine.render import view_maps as views
+from advtex_engine.render import pairs
 from advtex_engine.render.pairs import example_differences, overlaps, related_pairs
 from advtex_engine.render.reproject import reproject, unproject_pixels
 from advtex_engine.render.texture import decode_uv
@@ -197,7 +197,7 @@ def test_overlaps_are_the_same_where_views_come_from_the_host_and_each_is_copied
 
     other = torch.device("cpu:0")  # not equal to the tensors' device
     monkeypatch.setattr(ViewMaps, "device", property(lambda _: other))
-    monkeypatch.setattr(views, "TOGETHER", 4)
+    monkeypatch.setattr(pairs, "TOGETHER", 4)
     elsewhere = replace(maps, depth=maps.depth.as_subclass(Copied))
     assert overlaps(elsewhere, "object", 15.0, range(6)).equal(share)
     assert copied == [4, 2]

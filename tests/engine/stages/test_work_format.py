@@ -109,7 +109,7 @@ def test_files_of_this_version_are_used_without_a_word(stopped: Path, folder: Pa
 
 
 def test_what_another_version_left_is_made_anew(stopped: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("advtex_engine.stages.fingerprint.FORMAT", checkpoint.FORMAT + 1)
+    monkeypatch.setattr("advtex_engine.stages.identity.FORMAT", checkpoint.FORMAT + 1)
     (note,) = [note for note in resumed(stopped, folder) if "work folder" in note]
     assert "by another version" in note
 

@@ -1,7 +1,7 @@
 """The stages around the method, each from the work folder where an earlier attempt has done it."""
 
 from advtex_engine.stages.atlas import fitting_atlas
-from advtex_engine.stages.fingerprint import fingerprint
+from advtex_engine.stages.identity import fingerprint
 from advtex_engine.stages.initial_texture import method_input
 from advtex_engine.stages.refinement import refined_scene
 from advtex_engine.stages.scene import MadeScene, cached_scene

@@ -226,7 +226,7 @@ def test_examples_differ_as_their_colors_do_wherever_the_views_are_kept(monkeypa
         assert float(found[source, auxiliary]) == pytest.approx(float(expected), abs=0.6)
 
     monkeypatch.setattr(ViewMaps, "device", property(lambda _: torch.device("cpu:0")))
-    monkeypatch.setattr(views, "TOGETHER", 3)
+    monkeypatch.setattr(pairs, "TOGETHER", 3)
     assert torch.equal(example_differences(maps, "object", related), found)
 
 

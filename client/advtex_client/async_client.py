@@ -1,4 +1,7 @@
-"""The client for asyncio programs: `AsyncClient`, method for method the same as `Client`."""
+"""The client for asyncio programs: `AsyncClient`, method for method the same as `Client`.
+
+`client.py` is made of this file: after a change, run `python client/make_sync_client.py`.
+"""
 
 from __future__ import annotations
 
@@ -217,8 +220,8 @@ class AsyncClient:
                     yield job
                 if watch.done:
                     return
-                async for job in self._events(watch):
-                    yield job
+                async for news in self._events(watch):
+                    yield news
             except ClientError as error:
                 watch.trouble(error)
             if watch.done:

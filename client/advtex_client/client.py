@@ -1,10 +1,13 @@
-"""The client for programs that wait: `Client`."""
+"""The client for programs that wait: `Client`.
+
+This file is made of `async_client.py`: edit that one, then run `python client/make_sync_client.py`.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -79,7 +82,9 @@ class Client:
 
     def upload(self, scan: Path, *, on_bytes: OnBytes | None = None) -> UploadView:
         """Send a scan, zip or folder."""
-        with packed(scan) as archive, upload_alone(self.config.url, archive.sha256):
+        with ExitStack() as stack:
+            archive = stack.enter_context(packed(scan))
+            stack.enter_context(upload_alone(self.config.url, archive.sha256))
             return self._drive(sending(archive, self._retries, on_bytes))
 
     def get_upload(self, upload_id: str) -> UploadView:
@@ -107,7 +112,8 @@ class Client:
         """
         spec = job_spec(options, label, priority=priority, retention_seconds=retention_seconds)
         ensure_submittable(scan, spec.options)
-        with packed(scan) as archive:
+        with ExitStack() as stack:
+            archive = stack.enter_context(packed(scan))
             memory = SubmissionMemory(self.config.url, archive.sha256, spec.options.model_dump_json(), label)
             return self._submit(memory, archive, spec, new, on_bytes)
 
@@ -118,13 +124,16 @@ class Client:
             with suppress(NotFoundError):
                 return self.get_job(job_id)
         ensure_submittable(scan, spec.options)
-        with packed(scan) as archive:
+        with ExitStack() as stack:
+            archive = stack.enter_context(packed(scan))
             return self._submit(memory, archive, spec, False, None)
 
     def _submit(
         self, memory: SubmissionMemory, archive: PackedScan, spec: JobSpec, new: bool, on_bytes: OnBytes | None
     ) -> JobView:
-        with memory.alone(), upload_alone(self.config.url, archive.sha256):
+        with ExitStack() as stack:
+            stack.enter_context(memory.alone())
+            stack.enter_context(upload_alone(self.config.url, archive.sha256))
             return self._drive(submission(memory, archive, spec, retries=self._retries, new=new, on_bytes=on_bytes))
 
     def _drive(self, steps: Generator[Step, Any, T]) -> T:

@@ -63,7 +63,7 @@ class Call(Generic[T]):
 
 @dataclass(frozen=True)
 class Pause:
-    """Seconds to wait before the next call."""
+    """A wait of `seconds` before the next call."""
 
     seconds: float
 
@@ -131,12 +131,12 @@ def retry_batch(batch_id: str) -> Call[BatchView]:
 
 
 def find_uploads(sha256: str) -> Call[UploadList]:
-    """What the server holds of these bytes."""
+    """Ask what the server holds of these bytes."""
     return Call("GET", "/v1/uploads", reader(UploadList), params={"sha256": sha256})
 
 
 def begin_upload(scan: PackedScan) -> Call[UploadView]:
-    """A resumable upload (tus 1.0.0). Not sent again blindly: the server holds room for every one that it began."""
+    """Begin a resumable upload (tus 1.0.0). It is not sent again blindly: the server holds room for every one begun."""
     given = {"filename": scan.filename, "sha256": scan.sha256}
     pairs = (f"{name} {base64.b64encode(value.encode()).decode()}" for name, value in given.items())
     headers = TUS | {"Upload-Length": str(scan.size), "Upload-Metadata": ",".join(pairs)}
@@ -144,12 +144,13 @@ def begin_upload(scan: PackedScan) -> Call[UploadView]:
 
 
 def upload_offset(upload_id: str) -> Call[int]:
-    """Where to go on, once the line broke."""
+    """Ask where to go on, once the line broke."""
     return Call("HEAD", _upload(upload_id), _offset, headers=TUS)
 
 
 def send_piece(upload_id: str, piece: FileStream) -> Call[int]:
-    """-> the new offset. Not sent again as it is: first the server must say how much of it came."""
+    """Send bytes of an upload; the answer is the new offset. It is not sent again as it is: first the server must say
+    how much of it came."""
     headers = TUS | {
         "Content-Type": "application/offset+octet-stream",
         "Content-Length": str(piece.stop - piece.start),
@@ -175,7 +176,7 @@ def _job(job_id: str) -> str:
 
 
 def reader(model: type[M]) -> Callable[[httpx.Response], M]:
-    """Reads a success's body as `model`; anything else is raised."""
+    """Return what reads a success's body as `model`, and raises ApiError or ClientError for any other answer."""
 
     def read(response: httpx.Response) -> M:
         raise_for_error(response)
@@ -191,7 +192,7 @@ def reader(model: type[M]) -> Callable[[httpx.Response], M]:
 
 
 def _readiness(response: httpx.Response) -> Readiness:
-    """Its 503 has the same body, with what is wrong."""
+    """Read the answer of either status: a 503 has the same body, with what is wrong."""
     if response.status_code == 503:
         with suppress(ValidationError):
             return Readiness.model_validate_json(response.content)
@@ -226,7 +227,8 @@ class Attempts:
         self._made = 0
 
     def after_error(self, error: httpx.TransportError | ClientError) -> float:
-        """Raises the error, as a ClientError, when it will not pass or there is nothing left to try."""
+        """Return the seconds to wait. Raises the error, as a ClientError, when it will not pass or there is nothing
+        left to try."""
         again = (
             is_passing(error) if isinstance(error, ClientError) else self._idempotent or isinstance(error, NEVER_SENT)
         )
@@ -237,7 +239,8 @@ class Attempts:
         raise network_error(error) from error
 
     def after_response(self, response: httpx.Response) -> float | None:
-        """None when the answer stands. 429 and 503 refuse before anything is done, so they are safe to repeat."""
+        """Return the seconds to wait, None when the answer stands. 429 and 503 refuse before anything is done, so they
+        are safe to repeat."""
         status = response.status_code
         again = status in REFUSED or (status in TRANSIENT and self._idempotent) or _in_flight(response)
         if self._left <= 0 or not again:
@@ -253,7 +256,7 @@ class Attempts:
 
 
 def _in_flight(response: httpx.Response) -> bool:
-    """The same idempotent request is being answered right now; its answer can be had a little later."""
+    """Tell whether the same idempotent request is being answered right now; its answer can be had a little later."""
     return response.status_code == 409 and error_from_response(response).error.code is ErrorCode.idempotency_in_flight
 
 
@@ -266,12 +269,12 @@ def network_error(error: httpx.TransportError) -> NetworkError:
 
 
 def is_passing(error: ClientError) -> bool:
-    """True for trouble of the line or the server that says nothing about a job and may be over soon."""
+    """Tell whether this is trouble of the line or the server that says nothing about a job and may be over soon."""
     return isinstance(error, (NetworkError, BusyError)) or (isinstance(error, ApiError) and error.status >= 500)
 
 
 def chosen_results(job: JobView, names: Sequence[str] | None) -> list[ResultFile]:
-    """The job's result files, all or the named ones. Raises ClientError when there are none to fetch."""
+    """Return the job's result files, all or the named ones. Raises ClientError when there are none to fetch."""
     if not job.results:
         raise ClientError(f"job {job.id} has no results ({job.state}); `watch` it until it has succeeded")
     by_name = {file.name: file for file in job.results}
@@ -282,7 +285,7 @@ def chosen_results(job: JobView, names: Sequence[str] | None) -> list[ResultFile
 
 
 def ensure_succeeded(job: JobView) -> JobView:
-    """The job itself if it succeeded; else the exception that says how it ended."""
+    """Return the job itself if it succeeded. Raises ScanRejectedError or JobFailedError, which say how it ended."""
     reason = job.error.message if job.error else "no reason was given"
     if job.state is JobState.rejected:
         raise ScanRejectedError(f"job {job.id} was rejected: {reason}", job.error.details if job.error else (), job)

@@ -85,7 +85,7 @@ def exit_code_of(error: ClientError) -> int:
 
 @contextmanager
 def command(as_json: bool) -> Iterator[Display]:
-    """Every command's frame: errors become one message and an exit code."""
+    """Frame a command: errors become one message and an exit code."""
     display = Display(as_json)
     try:
         yield display
@@ -99,7 +99,7 @@ def command(as_json: bool) -> Iterator[Display]:
 
 
 def parsed_size(size: str | None) -> tuple[int | None, int | None]:
-    """Width and height of `--size`; ClientError."""
+    """Return the width and height that `--size` names, in pixels. Raises ClientError."""
     if size is None:
         return None, None
     match = re.fullmatch(r"(\d{1,6})[x×](\d{1,6})", size.strip().lower())
@@ -109,7 +109,7 @@ def parsed_size(size: str | None) -> tuple[int | None, int | None]:
 
 
 def retention(keep_days: float | None) -> int | None:
-    """`--keep-days` in seconds; ClientError."""
+    """Return `--keep-days` in seconds. Raises ClientError."""
     try:
         return None if keep_days is None else retention_seconds(keep_days)
     except ValueError as error:
@@ -117,7 +117,7 @@ def retention(keep_days: float | None) -> int | None:
 
 
 def job_options(**given: object) -> JobOptions:
-    """Those that were given; ClientError for one that is out of bounds."""
+    """Return the options, those that were not given at their defaults. Raises ClientError for one out of bounds."""
     try:
         return JobOptions.model_validate({name: value for name, value in given.items() if value is not None})
     except ValidationError as error:

@@ -30,15 +30,15 @@ class Display:
         self.notes = Console(stderr=True, highlight=False, soft_wrap=True)
 
     def note(self, text: str) -> None:
-        """A line for people, on stderr."""
+        """Print a line for people, on stderr."""
         self.notes.print(text, markup=False)
 
     def data(self, value: BaseModel | Sequence[BaseModel] | dict[str, Any] | list[Any], text: str) -> None:
-        """The command's result, on stdout: `value` as one line of JSON, or `text`."""
+        """Print the command's result, on stdout: `value` as one line of JSON, or `text`."""
         print(json.dumps(_plain(value)) if self.as_json else text, flush=True)
 
     def failure(self, error: ClientError, exit_code: int) -> None:
-        """An error, on stderr."""
+        """Print an error, on stderr."""
         if self.as_json:
             body = {"code": error.code, "message": str(error), "exit_code": exit_code, "details": _plain(error.details)}
             print(json.dumps({"error": body}), file=sys.stderr, flush=True)
@@ -49,21 +49,21 @@ class Display:
 
     @contextmanager
     def bytes_bar(self, title: str) -> Iterator[BytesBar]:
-        """A bar for an upload or a download."""
+        """Show a bar for an upload or a download."""
         columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
         with Progress(*columns, console=self.notes, transient=True, disable=not self._bars) as bars:
             yield BytesBar(bars, title)
 
     @contextmanager
     def job_bar(self) -> Iterator[JobBar]:
-        """A bar for a job's stages and steps; a line per stage where stderr is no terminal."""
+        """Show a bar for a job's stages and steps; a line per stage where stderr is no terminal."""
         columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[detail]}"))
         with Progress(*columns, console=self.notes, transient=True, disable=not self._bars) as bars:
             yield JobBar(bars, self)
 
     @contextmanager
     def count_bar(self, title: str, total: int) -> Iterator[Callable[[], None]]:
-        """A bar that moves by one."""
+        """Show a bar that moves by one whenever what this yields is called."""
         columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"))
         with Progress(*columns, console=self.notes, transient=True, disable=not self._bars) as bars:
             task = bars.add_task(title, total=total)
@@ -71,7 +71,7 @@ class Display:
 
     @contextmanager
     def batch_bar(self) -> Iterator[Callable[[BatchView, Sequence[str]], None]]:
-        """A bar of the jobs that have ended; a line per change where stderr is no terminal."""
+        """Show a bar of the jobs that have ended; a line per change where stderr is no terminal."""
         columns = (TextColumn("{task.description}"), BarColumn())
         with Progress(*columns, console=self.notes, transient=True, disable=not self._bars) as bars:
             task = bars.add_task("", total=None)
@@ -86,7 +86,7 @@ class Display:
             yield show
 
     def once(self, text: object) -> None:
-        """A note, unless it was the last one too."""
+        """Print a note, unless it was the last one too."""
         if str(text) != self._said:
             self._said = str(text)
             self.note(self._said)
@@ -144,7 +144,7 @@ class JobBar:
 
 
 def duration(seconds: float) -> str:
-    """`42 s`, `3 min 20 s`, `2 h 5 min`."""
+    """Return the time in words: `42 s`, `3 min 20 s`, `2 h 5 min`."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"
@@ -154,7 +154,7 @@ def duration(seconds: float) -> str:
 
 
 def finding_lines(details: Iterable[ErrorDetail]) -> list[str]:
-    """One line per finding: severity, place, what is wrong, what helps."""
+    """Return one line per finding: severity, place, what is wrong, what helps."""
     return [
         f"{d.severity}: {d.where + ': ' if d.where else ''}{d.message}{f' -> {d.remedy}' if d.remedy else ''}"
         for d in details
@@ -162,7 +162,7 @@ def finding_lines(details: Iterable[ErrorDetail]) -> list[str]:
 
 
 def job_lines(job: JobView) -> str:
-    """A job for people."""
+    """Describe a job for people."""
     progress = job.progress
     lines = [f"job      {job.id}", f"state    {job.state}" + (f" (attempt {job.attempt})" if job.attempt > 1 else "")]
     if job.waiting_reason:
@@ -190,7 +190,7 @@ def job_lines(job: JobView) -> str:
 
 
 def result_lines(files: Sequence[ResultFile]) -> list[str]:
-    """The files, those of a folder in one line."""
+    """List the files, those of a folder in one line."""
     folders: dict[str, list[int]] = {}
     for file in files:
         folder, slash, _ = file.name.partition("/")
@@ -202,7 +202,7 @@ def result_lines(files: Sequence[ResultFile]) -> list[str]:
 
 
 def job_table(jobs: Sequence[JobView]) -> str:
-    """Jobs as a table for people, newest first; the stage of one that waits is why it does."""
+    """List jobs as a table for people, newest first; the stage of one that waits is why it does."""
     table = Table(box=None, pad_edge=False)
     for title in ("job", "state", "stage", "created", "label"):
         table.add_column(title, overflow="fold")
@@ -214,7 +214,7 @@ def job_table(jobs: Sequence[JobView]) -> str:
 
 
 def batch_line(batch: BatchView, reasons: Sequence[str] = ()) -> str:
-    """`night: 30 jobs, 12 succeeded, 18 queued, about 2 h 5 min left; waiting: no worker is running`."""
+    """Describe a batch: `night: 30 jobs, 12 succeeded, 18 queued, about 2 h left; waiting: no worker is running`."""
     parts = [f"{batch.jobs} jobs", *(f"{count} {state}" for state, count in sorted(batch.states.items()))]
     if batch.eta_seconds and not batch.finished:
         parts.append(f"about {duration(batch.eta_seconds)} left")
@@ -223,7 +223,7 @@ def batch_line(batch: BatchView, reasons: Sequence[str] = ()) -> str:
 
 
 def batch_table(rows: Sequence[dict[str, Any]]) -> str:
-    """What the jobs of a batch came to, with a column per score."""
+    """List what the jobs of a batch came to, with a column per score."""
     scores = list(dict.fromkeys(name for row in rows for name in row.get("scores", {})))
     table = Table(box=None, pad_edge=False)
     for title in ("label", "state", "steps", "time", *scores):

@@ -31,7 +31,7 @@ class Event:
 
 
 class EventParser:
-    """Feed it lines without their line ends; it returns an event at each blank line that ends one."""
+    """Puts events together: it takes lines without their line ends, and returns an event at the blank line after it."""
 
     def __init__(self) -> None:
         self.last_id = ""
@@ -55,7 +55,7 @@ class EventParser:
 
 
 class Watch:
-    """The newest view of a job, the deadline, and how long the line has been silent. Shared by both clients."""
+    """What is known of a job that is followed: its newest view, the deadline, and how long the line has been silent."""
 
     def __init__(self, job_id: str, timeout: float | None, on_trouble: OnTrouble | None) -> None:
         self.job_id = job_id
@@ -82,7 +82,7 @@ class Watch:
         return True
 
     def view_from_line(self, line: str) -> JobView | None:
-        """The job's view that a line of the stream completes, if it does and if it is news."""
+        """Return the job's view that a line of the stream completes, if it does and if it is news."""
         self._heard = time.monotonic()
         event = self._parser.feed(line)
         if event is None:
@@ -101,7 +101,7 @@ class Watch:
         return httpx.Timeout(10.0, read=max(0.05, min(SILENCE_SECONDS, self._remaining())))
 
     def pause(self) -> float:
-        """Seconds until the next poll. Raises WaitTimeoutError when the deadline has passed."""
+        """Return the seconds until the next poll. Raises WaitTimeoutError when the deadline has passed."""
         remaining = self._remaining()
         if remaining <= 0:
             state = f"{self.job.state} at last sight" if self.job else "not seen yet"
@@ -112,7 +112,7 @@ class Watch:
         return min(POLL_SECONDS, remaining)
 
     def trouble(self, error: ClientError) -> None:
-        """Trouble on the line is never the job's failure: say so and go on. Raises what will not pass."""
+        """Say that the line is in trouble, which is never the job's failure, and go on. Raises what will not pass."""
         if not is_passing(error):
             raise error
         if time.monotonic() - self._heard > PATIENCE_SECONDS:

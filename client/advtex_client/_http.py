@@ -34,7 +34,8 @@ def build(http: httpx.Client | httpx.AsyncClient, call: Call[Any]) -> httpx.Requ
 
 
 def result_url(base: str, file: ResultFile) -> str:
-    """The address of a result: always on the same server, whatever the answer says, so the key goes nowhere else."""
+    """Return the address of a result. It is always on the same server, whatever the answer says, so the key goes
+    nowhere else; raises IntegrityError."""
     url = httpx.URL(base + "/").join(file.url)
     home = httpx.URL(base)
     if (url.scheme, url.host, url.port) != (home.scheme, home.host, home.port):

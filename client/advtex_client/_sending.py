@@ -21,7 +21,7 @@ Step = calls.Call[Any] | calls.Pause
 def sending(
     scan: PackedScan, retries: int, on_bytes: OnBytes | None = None, known_id: str | None = None
 ) -> Generator[Step, Any, UploadView]:
-    """What the server holds of these bytes already is not sent again, whoever sent it with this key and when.
+    """Send what the server does not hold yet of these bytes, whoever sent the rest with this key and when.
 
     known_id: the upload to go on with, if the server still has it. The line may break any number of times; after
     `retries` tries in a row that brought nothing, the error is raised.
@@ -56,7 +56,7 @@ def sending(
 
 
 def _held(scan: PackedScan, known_id: str | None) -> Generator[Step, Any, UploadView]:
-    """The upload that came farthest, or a new one."""
+    """Return the upload that came farthest, or a new one."""
     try:
         found = (yield calls.find_uploads(scan.sha256)).uploads
         if not found:
@@ -71,6 +71,6 @@ def _held(scan: PackedScan, known_id: str | None) -> Generator[Step, Any, Upload
 
 
 def _may_pass(error: ClientError) -> bool:
-    """Trouble of the line or of the server, or an upload that is not where it was thought to be."""
+    """Tell whether it is trouble of the line or of the server, or an upload that is not where it was thought to be."""
     timed_out = isinstance(error, ApiError) and error.status == TIMED_OUT
     return calls.is_passing(error) or isinstance(error, ConflictError) or timed_out

@@ -33,7 +33,7 @@ def job_spec(
     priority: int = 0,
     retention_seconds: int | None = None,
 ) -> JobSpec:
-    """What to ask for, with no upload yet; ClientError for what no server would accept."""
+    """Return what to ask for, with no upload yet. Raises ClientError for what no server would accept."""
     options = options or JobOptions()
     try:
         return JobSpec(
@@ -50,7 +50,7 @@ def job_spec(
 
 
 def ensure_submittable(scan: Path, options: JobOptions) -> None:
-    """The check that the server makes too, before anything is sent. Raises ScanRejectedError with every finding."""
+    """Make the server's check before anything is sent. Raises ScanRejectedError with every finding."""
     report = check_scan(scan, options.layout)
     if report.ok:
         return
@@ -104,7 +104,7 @@ def submission(
 def _uploaded(
     memory: SubmissionMemory, known: Submission, scan: PackedScan, retries: int, on_bytes: OnBytes | None
 ) -> Generator[Step, Any, Submission]:
-    """The submission with an upload that the server holds whole."""
+    """Return the submission with an upload that the server holds whole."""
     upload = yield from sending(scan, retries, on_bytes, known.upload_id)
     if upload.id != known.upload_id:
         known = known.model_copy(update={"upload_id": upload.id})

@@ -1,4 +1,7 @@
-"""The client for asyncio programs: `AsyncClient`, method for method the same as `Client`."""
+"""The client for asyncio programs: `AsyncClient`, method for method the same as `Client`.
+
+`client.py` is made of this file: after a change, run `python client/make_sync_client.py`.
+"""
 
 from __future__ import annotations
 
@@ -64,18 +67,19 @@ class AsyncClient:
         await self.close()
 
     async def close(self) -> None:
+        """Close the connections, as leaving the context does."""
         await self._http.aclose()
 
     async def ping(self) -> None:
-        """Raises a ClientError unless an advtex server answers."""
+        """Raise a ClientError unless an advtex server answers."""
         await self._run(calls.alive(), retries=0)
 
     async def readiness(self) -> Readiness:
-        """Whether the server can accept work, and how each of its parts is."""
+        """Return whether the server can accept work, and how each of its parts is."""
         return await self._run(calls.readiness(), retries=0)
 
     async def get_key(self) -> KeyView:
-        """What this client's key may do."""
+        """Return what this client's key may do."""
         return await self._run(calls.get_key(), retries=0)
 
     async def upload(self, scan: Path, *, on_bytes: OnBytes | None = None) -> UploadView:
@@ -86,6 +90,7 @@ class AsyncClient:
             return await self._drive(sending(archive, self._retries, on_bytes))
 
     async def get_upload(self, upload_id: str) -> UploadView:
+        """Return how much of an upload the server holds, and its sha256 once it is whole."""
         return await self._run(calls.get_upload(upload_id))
 
     async def create_job(self, spec: JobSpec, *, idempotency_key: str) -> JobView:
@@ -155,12 +160,13 @@ class AsyncClient:
             return result
 
     async def get_job(self, job_id: str) -> JobView:
+        """Return a job as it is now. Raises NotFoundError if this key may see none of this id."""
         return await self._run(calls.get_job(job_id))
 
     async def list_jobs(
         self, *, state: JobState | None = None, label: str | None = None, batch: str | None = None, page: int = 100
     ) -> AsyncIterator[JobView]:
-        """All jobs, newest first, fetched page by page."""
+        """Yield all jobs, newest first, fetched page by page."""
         cursor = None
         while True:
             answer = await self._run(calls.list_jobs(state, label, batch, page, cursor))
@@ -170,11 +176,11 @@ class AsyncClient:
                 return
 
     async def get_batch(self, batch_id: str) -> BatchView:
-        """How the jobs of a batch stand, and how long the rest takes."""
+        """Return how the jobs of a batch stand, and how long the rest takes."""
         return await self._run(calls.get_batch(batch_id))
 
     async def list_batches(self, *, page: int = 100) -> AsyncIterator[BatchView]:
-        """All batches, newest first, fetched page by page."""
+        """Yield all batches, newest first, fetched page by page."""
         cursor = None
         while True:
             answer = await self._run(calls.list_batches(page, cursor))
@@ -200,12 +206,13 @@ class AsyncClient:
         return await self._run(calls.retry_job(job_id))
 
     async def delete_job(self, job_id: str) -> None:
+        """Delete an ended job and its results on the server. Raises ConflictError while it has not ended."""
         await self._run(calls.delete_job(job_id))
 
     async def watch_job(
         self, job_id: str, *, timeout: float | None = None, on_trouble: OnTrouble | None = None
     ) -> AsyncIterator[JobView]:
-        """Every change of a job until it ends, the last one included. Events where the server sends them, else polls.
+        """Yield every change of a job until it ends, the last one included: by server-sent events, or else by polling.
 
         Trouble on the line is reported to `on_trouble` and outlived. Raises WaitTimeoutError after `timeout` seconds.
         """
@@ -217,8 +224,8 @@ class AsyncClient:
                     yield job
                 if watch.done:
                     return
-                async for job in self._events(watch):
-                    yield job
+                async for news in self._events(watch):
+                    yield news
             except ClientError as error:
                 watch.trouble(error)
             if watch.done:
@@ -226,7 +233,7 @@ class AsyncClient:
             await anyio.sleep(watch.pause())
 
     async def wait_for_job(self, job_id: str, *, timeout: float | None = None) -> JobView:
-        """The finished job. Raises JobFailedError or ScanRejectedError when it did not succeed."""
+        """Return the finished job. Raises JobFailedError or ScanRejectedError when it did not succeed."""
         last = None
         async for job in self.watch_job(job_id, timeout=timeout):
             last = job
@@ -273,7 +280,7 @@ class AsyncClient:
                     on_bytes(file, download.done)
 
     async def _events(self, watch: Watch) -> AsyncIterator[JobView]:
-        """News from the event stream, until it ends in whatever way."""
+        """Yield news from the event stream, until it ends in whatever way."""
         path = calls.events_path(watch.job_id)
         try:
             async with self._http.stream(

@@ -61,7 +61,7 @@ def remember(server: str, batch_id: str, run: BatchRun, folder: Path | None = No
 
 
 def remembered(server: str, batch_id: str, folder: Path | None = None) -> BatchRun:
-    """How a batch was submitted on this computer; ClientError if it was not."""
+    """Return how a batch was submitted on this computer. Raises ClientError if it was not."""
     try:
         return BatchRun.model_validate_json(_path(server, batch_id, folder).read_bytes())
     except (FileNotFoundError, ValidationError) as error:
@@ -74,8 +74,8 @@ def remembered(server: str, batch_id: str, folder: Path | None = None) -> BatchR
 def submit_batch(
     client: Client, batch_id: str, items: Sequence[BatchItem], on_full: OnFull = lambda _: None
 ) -> Iterator[Outcome]:
-    """One outcome per item, as they come. A scan that is refused does not stop the others; a lost line or a wrong key
-    raises, and running it again goes on."""
+    """Yield one outcome per item, as they come. A scan that is refused does not stop the others; a lost line or a wrong
+    key raises, and running it again goes on."""
     for item in items:
         _spec(batch_id, item)  # nothing is sent if one cannot be
     sent = [item for item in items if item.path is not None]
@@ -87,7 +87,7 @@ def submit_batch(
 
 
 def result_rows(client: Client, batch_id: str) -> Iterator[dict[str, Any]]:
-    """A batch's jobs, sorted by label, for a table: what each came to, and its scores where frames were held out."""
+    """Yield a batch's jobs, sorted by label, for a table: what each came to, and its scores where there are any."""
     for job in sorted(client.list_jobs(batch=batch_id), key=lambda job: (job.label, job.id)):
         row: dict[str, Any] = {"job": job.id, "label": job.label, "state": job.state.value, "steps": job.progress.steps}
         row["seconds"] = round(sum(job.progress.stage_seconds.values()), 1)
@@ -99,7 +99,7 @@ def result_rows(client: Client, batch_id: str) -> Iterator[dict[str, Any]]:
 
 
 def waiting_reasons(client: Client, batch: BatchView) -> list[str]:
-    """Why jobs of a batch wait, the most frequent reason first; of the newest ones, where there are many."""
+    """Return why jobs of a batch wait, the most frequent reason first; of the newest ones, where there are many."""
     found: Counter[str] = Counter()
     for state in WAITING:
         if batch.states.get(state):
@@ -109,7 +109,7 @@ def waiting_reasons(client: Client, batch: BatchView) -> list[str]:
 
 
 def _scores(client: Client, job: JobView) -> dict[str, float]:
-    """Means over the held-out views, from the job's report; empty if none was held out."""
+    """Return the means over the held-out views, from the job's report; empty if none was held out."""
     with TemporaryDirectory(prefix="advtex-") as folder:
         (path,) = client.download_results(job, Path(folder), names=[REPORT])
         try:

@@ -107,7 +107,7 @@ def status(
     api_key: ApiKey = None,
     as_json: AsJson = False,
 ) -> None:
-    """How many jobs are in which state, and how long the rest takes."""
+    """Say how many jobs are in which state, and how long the rest takes."""
     with command(as_json) as display, Client(url, api_key) as client:
         view = client.get_batch(batch)
         if wait:

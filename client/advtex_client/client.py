@@ -1,10 +1,13 @@
-"""The client for programs that wait: `Client`."""
+"""The client for programs that wait: `Client`.
+
+This file is made of `async_client.py`: edit that one, then run `python client/make_sync_client.py`.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -63,26 +66,30 @@ class Client:
         self.close()
 
     def close(self) -> None:
+        """Close the connections, as leaving the context does."""
         self._http.close()
 
     def ping(self) -> None:
-        """Raises a ClientError unless an advtex server answers."""
+        """Raise a ClientError unless an advtex server answers."""
         self._run(calls.alive(), retries=0)
 
     def readiness(self) -> Readiness:
-        """Whether the server can accept work, and how each of its parts is."""
+        """Return whether the server can accept work, and how each of its parts is."""
         return self._run(calls.readiness(), retries=0)
 
     def get_key(self) -> KeyView:
-        """What this client's key may do."""
+        """Return what this client's key may do."""
         return self._run(calls.get_key(), retries=0)
 
     def upload(self, scan: Path, *, on_bytes: OnBytes | None = None) -> UploadView:
         """Send a scan, zip or folder."""
-        with packed(scan) as archive, upload_alone(self.config.url, archive.sha256):
+        with ExitStack() as stack:
+            archive = stack.enter_context(packed(scan))
+            stack.enter_context(upload_alone(self.config.url, archive.sha256))
             return self._drive(sending(archive, self._retries, on_bytes))
 
     def get_upload(self, upload_id: str) -> UploadView:
+        """Return how much of an upload the server holds, and its sha256 once it is whole."""
         return self._run(calls.get_upload(upload_id))
 
     def create_job(self, spec: JobSpec, *, idempotency_key: str) -> JobView:
@@ -107,7 +114,8 @@ class Client:
         """
         spec = job_spec(options, label, priority=priority, retention_seconds=retention_seconds)
         ensure_submittable(scan, spec.options)
-        with packed(scan) as archive:
+        with ExitStack() as stack:
+            archive = stack.enter_context(packed(scan))
             memory = SubmissionMemory(self.config.url, archive.sha256, spec.options.model_dump_json(), label)
             return self._submit(memory, archive, spec, new, on_bytes)
 
@@ -118,13 +126,16 @@ class Client:
             with suppress(NotFoundError):
                 return self.get_job(job_id)
         ensure_submittable(scan, spec.options)
-        with packed(scan) as archive:
+        with ExitStack() as stack:
+            archive = stack.enter_context(packed(scan))
             return self._submit(memory, archive, spec, False, None)
 
     def _submit(
         self, memory: SubmissionMemory, archive: PackedScan, spec: JobSpec, new: bool, on_bytes: OnBytes | None
     ) -> JobView:
-        with memory.alone(), upload_alone(self.config.url, archive.sha256):
+        with ExitStack() as stack:
+            stack.enter_context(memory.alone())
+            stack.enter_context(upload_alone(self.config.url, archive.sha256))
             return self._drive(submission(memory, archive, spec, retries=self._retries, new=new, on_bytes=on_bytes))
 
     def _drive(self, steps: Generator[Step, Any, T]) -> T:
@@ -146,12 +157,13 @@ class Client:
             return result
 
     def get_job(self, job_id: str) -> JobView:
+        """Return a job as it is now. Raises NotFoundError if this key may see none of this id."""
         return self._run(calls.get_job(job_id))
 
     def list_jobs(
         self, *, state: JobState | None = None, label: str | None = None, batch: str | None = None, page: int = 100
     ) -> Iterator[JobView]:
-        """All jobs, newest first, fetched page by page."""
+        """Yield all jobs, newest first, fetched page by page."""
         cursor = None
         while True:
             answer = self._run(calls.list_jobs(state, label, batch, page, cursor))
@@ -160,11 +172,11 @@ class Client:
                 return
 
     def get_batch(self, batch_id: str) -> BatchView:
-        """How the jobs of a batch stand, and how long the rest takes."""
+        """Return how the jobs of a batch stand, and how long the rest takes."""
         return self._run(calls.get_batch(batch_id))
 
     def list_batches(self, *, page: int = 100) -> Iterator[BatchView]:
-        """All batches, newest first, fetched page by page."""
+        """Yield all batches, newest first, fetched page by page."""
         cursor = None
         while True:
             answer = self._run(calls.list_batches(page, cursor))
@@ -189,12 +201,13 @@ class Client:
         return self._run(calls.retry_job(job_id))
 
     def delete_job(self, job_id: str) -> None:
+        """Delete an ended job and its results on the server. Raises ConflictError while it has not ended."""
         self._run(calls.delete_job(job_id))
 
     def watch_job(
         self, job_id: str, *, timeout: float | None = None, on_trouble: OnTrouble | None = None
     ) -> Iterator[JobView]:
-        """Every change of a job until it ends, the last one included. Events where the server sends them, else polls.
+        """Yield every change of a job until it ends, the last one included: by server-sent events, or else by polling.
 
         Trouble on the line is reported to `on_trouble` and outlived. Raises WaitTimeoutError after `timeout` seconds.
         """
@@ -214,7 +227,7 @@ class Client:
             time.sleep(watch.pause())
 
     def wait_for_job(self, job_id: str, *, timeout: float | None = None) -> JobView:
-        """The finished job. Raises JobFailedError or ScanRejectedError when it did not succeed."""
+        """Return the finished job. Raises JobFailedError or ScanRejectedError when it did not succeed."""
         last = None
         for job in self.watch_job(job_id, timeout=timeout):
             last = job
@@ -261,7 +274,7 @@ class Client:
                     on_bytes(file, download.done)
 
     def _events(self, watch: Watch) -> Iterator[JobView]:
-        """News from the event stream, until it ends in whatever way."""
+        """Yield news from the event stream, until it ends in whatever way."""
         path = calls.events_path(watch.job_id)
         try:
             with self._http.stream(

@@ -17,8 +17,8 @@ from advtex_client.errors import ConfigError
 
 @dataclass(frozen=True)
 class ClientConfig:
-    """Base URL of the server without a trailing slash, and the key (empty where the server asks for none); and where
-    each was found."""
+    """The server's base URL without a trailing slash, its key (empty where it asks for none), and where each was
+    found."""
 
     url: str
     api_key: str
@@ -27,18 +27,18 @@ class ClientConfig:
 
 
 def user_file() -> Path:
-    """The user's own `url` and `api_key`, TOML."""
+    """Return the path of the user's own TOML file with `url` and `api_key`."""
     return platformdirs.user_config_path("advtex") / "config.toml"
 
 
 def embedded_file() -> Path:
-    """What `advtex-server up` writes for clients on the same machine."""
+    """Return the path of what `advtex-server up` writes for clients on the same machine."""
     folder = os.environ.get("ADVTEX_DATA_DIR")
     return (Path(folder) if folder else platformdirs.user_data_path("advtex")) / "client.json"
 
 
 def load_config(url: str | None = None, api_key: str | None = None) -> ClientConfig:
-    """The first source that names a server wins; no source's key is ever sent to a server that another one names.
+    """Find the server: the first source that names one wins, and no source's key is sent to another one's server.
 
     Order: arguments, ADVTEX_URL and ADVTEX_API_KEY, the user's TOML file, the embedded server's `client.json`.
     A key from a source that names no server fits any. Raises ConfigError.
@@ -63,7 +63,7 @@ def load_config(url: str | None = None, api_key: str | None = None) -> ClientCon
 
 
 def _read(path: Path) -> dict[str, str | None]:
-    """`url` and `api_key` of a TOML or JSON file; both None where the file is absent."""
+    """Read `url` and `api_key` of a TOML or JSON file; both are None where the file is absent. Raises ConfigError."""
     try:
         text = path.read_text(encoding="utf-8")
         data: Any = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)

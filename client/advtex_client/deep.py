@@ -15,7 +15,7 @@ ENGINE = "torch"  # the package of this name comes with the client; what it need
 
 
 def deep_report(scan: Path, layout: str | None) -> dict[str, Any] | None:
-    """What `advtex-engine check --json` says; None if the scan has too little to be measured. Raises ClientError."""
+    """Return what `advtex-engine check --json` says, None if too little can be measured. Raises ClientError."""
     if importlib.util.find_spec(ENGINE) is None:
         raise ClientError('check --deep needs the engine on this computer: pip install "advtex[worker]"')
     command = [sys.executable, "-m", "advtex_engine", "check", str(scan), "--json"]
@@ -30,7 +30,7 @@ def deep_report(scan: Path, layout: str | None) -> dict[str, Any] | None:
 
 
 def deep_lines(report: dict[str, Any] | None) -> list[str]:
-    """The report for people."""
+    """Describe the report for people."""
     if report is None:
         return ["measured nothing: there is neither depth nor a mesh, or no two frames"]
     lines = [f"measured {report['frames']} frames: {report['summary']}"]

@@ -36,7 +36,7 @@ class FolderNotWritable(ClientError):
 
 
 def examine(client: Client) -> Iterator[Finding]:
-    """Everything, in the order in which it is needed."""
+    """Look at everything, in the order in which it is needed."""
     config = client.config
     key_from = f"key from {config.api_key_from}" if config.api_key else "no key"
     yield Finding("configuration", True, f"{config.url} from {config.url_from}, {key_from}")
@@ -71,7 +71,7 @@ def _key(client: Client) -> Finding:
 
 
 def _described(key: KeyView) -> str:
-    """`0123456789ab may read, write; 2 of 20 active jobs; until 2030-01-01 00:00 UTC`."""
+    """Describe a key: `0123456789ab may read, write; 2 of 20 active jobs; until 2030-01-01 00:00 UTC`."""
     parts = [f"{key.id} may {', '.join(key.scopes)}"]
     if key.max_active_jobs is not None:
         parts.append(f"{key.active_jobs} of {key.max_active_jobs} active jobs")

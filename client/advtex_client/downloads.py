@@ -23,7 +23,7 @@ OnFileBytes = Callable[[ResultFile, int], None]
 
 
 def target_path(folder: Path, name: str) -> Path:
-    """Where the server's file `name` goes below `folder`; sub-folders are kept.
+    """Return where the server's file `name` goes below `folder`; sub-folders are kept.
 
     Raises IntegrityError for any name that could leave the folder or that some file system reads in another way.
     """
@@ -104,7 +104,7 @@ class Download:
         self.done += len(chunk)
 
     def finish(self) -> Path:
-        """Check size and digest, then rename. A file that is whole but wrong is thrown away."""
+        """Check size and digest, then rename. Raises NetworkError where another try helps, else IntegrityError."""
         assert self._sink is not None
         self._sink.flush()
         if self.done < self.file.size:
@@ -134,7 +134,7 @@ class Download:
 
 
 def is_there(path: Path, file: ResultFile) -> bool:
-    """True when `path` already holds exactly this content."""
+    """Tell whether `path` already holds exactly this content."""
     if not path.is_file() or path.stat().st_size != file.size:
         return False
     with path.open("rb") as stream:

@@ -28,7 +28,7 @@ from advtex_contract.jobs import JobView
 
 
 class ClientError(Exception):
-    """Base of everything this package raises on purpose. The message names the input and the remedy."""
+    """The base of everything that this package raises on purpose. The message names the input and the remedy."""
 
     code = "client_error"
     details: Sequence[ErrorDetail] = ()
@@ -52,7 +52,7 @@ class ScanRejectedError(ClientError):
 
 
 class NetworkError(ClientError):
-    """No answer from the server. It says nothing about any job."""
+    """The server did not answer. That says nothing about any job."""
 
     code = "network"
 
@@ -100,7 +100,7 @@ class AuthError(ApiError):
 
 
 class NotFoundError(ApiError):
-    """No such job, upload or result that this key may see."""
+    """There is no such job, upload or result that this key may see."""
 
 
 class ConflictError(ApiError):
@@ -134,7 +134,7 @@ _BY_STATUS: dict[int, type[ApiError]] = {
 
 
 def error_from_response(response: httpx.Response) -> ApiError:
-    """The exception for a 4xx or 5xx answer whose body has been read; a proxy's page is told apart."""
+    """Return the exception for a 4xx or 5xx answer whose body has been read; a proxy's page is told apart."""
     try:
         error = ErrorBody.model_validate_json(response.content)
     except ValidationError:

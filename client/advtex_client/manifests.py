@@ -45,7 +45,7 @@ class BatchItem:
 
 
 def retention_seconds(days: float) -> int:
-    """Whole seconds; ValueError for what is no time."""
+    """Return whole seconds. Raises ValueError for what is no time."""
     if not 0 < days < 1e6:
         raise ValueError(f"{days:g} is no number of days that a job could be kept")
     return round(days * 86400)
@@ -58,7 +58,7 @@ def read_items(
     by_reference: bool = False,
     retention: int | None = None,
 ) -> list[BatchItem]:
-    """The scans of a folder (each folder and zip in it), or those that a manifest lists; ClientError, with the line.
+    """Read the scans of a folder (each folder and zip in it) or of a manifest. Raises ClientError, with the line.
 
     by_reference: the server reads them at the same path; nothing is sent.
     options, priority, retention (seconds): of those that say nothing else.

@@ -21,13 +21,13 @@ if sys.platform != "win32":
 
 
 def upload_alone(server: str, sha256: str, folder: Path | None = None) -> AbstractContextManager[None]:
-    """One run at a time sends these bytes; another would take the upload over from it."""
+    """Let one run at a time send these bytes; another would take the upload over from it."""
     place = hashlib.sha256(f"{server}\n{sha256}".encode()).hexdigest()[:32]
     return _locked(_folder(folder) / "uploads" / f"{place}.lock")
 
 
 def check_writable(folder: Path | None = None) -> Path:
-    """The folder of what is remembered; OSError if nothing can be written there."""
+    """Return the folder of what is remembered. Raises OSError if nothing can be written there."""
     place = _folder(folder)
     place.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=place) as file:
@@ -58,7 +58,7 @@ class SubmissionMemory:
         return _locked(self.path.with_suffix(".lock"))
 
     def load(self) -> Submission:
-        """What is remembered; a fresh record when there is nothing, or nothing that can be read."""
+        """Return what is remembered; a fresh record when there is nothing, or nothing that can be read."""
         try:
             return Submission.model_validate_json(self.path.read_bytes())
         except (FileNotFoundError, ValidationError):
@@ -68,7 +68,7 @@ class SubmissionMemory:
         write_whole(self.path, submission.model_dump_json())
 
     def idempotency_key(self, submission: Submission) -> str:
-        """The same for every try of the same submission."""
+        """Return the key that is the same for every try of the same submission."""
         return f"{self._identity[:48]}{submission.salt}"
 
 

@@ -38,7 +38,7 @@ class PackedScan:
 
 @contextmanager
 def packed(scan: Path) -> Iterator[PackedScan]:
-    """The file itself, or a folder packed into a temporary zip that is gone afterwards.
+    """Yield the file itself, or a folder packed into a temporary zip that is gone afterwards.
 
     Equal folders give equal bytes: members are sorted, stored, and carry no dates or permissions. Names that begin
     with a dot are left out. Raises ClientError when the scan cannot be read or the temporary disk is full.
@@ -68,7 +68,7 @@ def _unreadable(scan: Path, error: OSError) -> str:
 
 
 def scan_members(folder: Path) -> list[tuple[str, Path]]:
-    """(name in the zip, file) of every file that belongs to the scan, sorted by name."""
+    """Return (name in the zip, file) for every file that belongs to the scan, sorted by name."""
     found = []
     for parent, folders, files in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
@@ -94,7 +94,7 @@ def _hashed(path: Path, filename: str) -> PackedScan:
 
 
 class FileStream(httpx.SyncByteStream, httpx.AsyncByteStream):
-    """Bytes `start` up to, not including, `stop` of a file as a request body, for both clients; readable again."""
+    """Bytes `start` up to, not including, `stop` of a file as a request body for both clients; it can be read again."""
 
     def __init__(self, scan: PackedScan, start: int = 0, on_bytes: OnBytes | None = None) -> None:
         self.start = start

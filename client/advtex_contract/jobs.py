@@ -101,7 +101,7 @@ class JobError(BaseModel):
 
 
 def known_options(stored: object) -> object:
-    """Options as they were stored, without those that only another version knows."""
+    """Return options as they were stored, without those that only another version knows."""
     if not isinstance(stored, Mapping):
         return stored
     return {name: value for name, value in stored.items() if name in JobOptions.model_fields}

@@ -15,7 +15,7 @@ ASPECT_TOLERANCE = 0.01  # ScanNet's 1296x968 pictures are often resampled to 64
 
 
 def check_frame(reader: ScanReader, frame: FrameEntry) -> FrameEntry | None:
-    """The frame with its color intrinsics at the image's size; None, with a finding, if it cannot be used."""
+    """Return the frame with its color intrinsics at the image's size; None, with a finding, if it cannot be used."""
     color = _color_camera(reader, frame)
     depth_is_sound = frame.depth is None or _depth_is_sound(reader, frame)
     if color is None or not depth_is_sound or not _mask_is_sound(reader, frame, color):
@@ -105,7 +105,7 @@ def _depth_is_sound(reader: ScanReader, frame: FrameEntry) -> bool:
 
 
 def _numbers_are_sound(reader: ScanReader, ref: ByteRange, camera: Intrinsics) -> bool:
-    """Whether a file of plain numbers has the camera's size, as far as can be told without unpacking it."""
+    """Tell whether a file of plain numbers has the camera's size, as far as can be told without unpacking it."""
     try:
         if ref.codec == "npy":
             header = read_npy_header(reader.archive, ref.path)
@@ -126,7 +126,7 @@ def _size_fits(reader: ScanReader, where: str, size: tuple[int, int], camera: In
 
 
 def _confidence_is_sound(reader: ScanReader, frame: FrameEntry) -> bool:
-    """Whether the confidence image fits the depth image; one that does not is left out, with a warning."""
+    """Tell whether the confidence image fits the depth image; one that does not is left out, with a warning."""
     confidence, camera = frame.confidence, frame.depth_intrinsics
     if confidence is None or frame.depth is None or camera is None:
         return False

@@ -58,7 +58,7 @@ class _State:
 
 
 def damaged(name: str, what: str) -> ArchiveError:
-    """The error for a member that does not decode."""
+    """Return the error for a member that does not decode."""
     return ArchiveError(Finding("error", "damaged_member", name, what, "make the zip again and upload all of it"))
 
 
@@ -152,7 +152,7 @@ def _stored(source: FileSource, extent: Extent, offset: int, length: int) -> byt
 
 
 def _next_input(source: FileSource, extent: Extent, state: _State) -> bytes:
-    """What the inflater left over, else the next stored bytes; empty at the member's end."""
+    """Return what the inflater left over, else the next stored bytes; empty at the member's end."""
     if state.inflater.unconsumed_tail:
         return state.inflater.unconsumed_tail
     piece = _stored(source, extent, state.consumed, min(INPUT_CHUNK, extent.stored - state.consumed))

@@ -14,7 +14,7 @@ MOST_TANGENTIAL = 0.1  # of p1 and p2; those of real lenses are below 0.02
 
 @lru_cache(maxsize=1024)
 def distortion_problem(camera: Intrinsics) -> str | None:
-    """Why a camera's distortion cannot be undone, None if it can or if there is none.
+    """Return why a camera's distortion cannot be undone, None if it can or if there is none.
 
     Rays at growing angles must come to lie at growing distances from the principal point, until the farthest corner
     is reached.

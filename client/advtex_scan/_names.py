@@ -11,7 +11,7 @@ _DRIVE = re.compile(r"[A-Za-z]:")
 
 
 def unsafe_reason(name: str) -> str | None:
-    """Why a member's name is refused, None if it is accepted.
+    """Return why a member's name is refused, None if it is accepted.
 
     Accepted are relative paths of printable characters without backslash, with no part that is empty, `.` or `..`.
     """
@@ -32,18 +32,18 @@ def unsafe_reason(name: str) -> str | None:
 
 
 def is_junk(name: str) -> bool:
-    """Files that operating systems leave in folders and zips."""
+    """Tell whether this is a file that operating systems leave in folders and zips."""
     parts = name.split("/")
     return parts[0] == "__MACOSX" or parts[-1] in JUNK_FILES or parts[-1].startswith("._")
 
 
 def is_nested_archive(name: str) -> bool:
-    """Archives inside archives are refused by name; their content is never looked at."""
+    """Tell whether this is an archive inside the archive: those are refused by name and never looked into."""
     return name.lower().endswith(ARCHIVE_SUFFIXES)
 
 
 def common_folder(names: list[str]) -> str:
-    """The folder, with its slash, below which all files lie; empty if they do not share one."""
+    """Return the folder, with its slash, below which all files lie; empty if they do not share one."""
     if not names:
         return ""
     first, last = min(names).split("/")[:-1], max(names).split("/")[:-1]

@@ -30,14 +30,14 @@ class NpyHeader:
 
 
 def check_lzfse(archive: ScanArchive, ref: ByteRange, size: int) -> None:
-    """Raises ArchiveError unless the bytes are an LZFSE stream that holds `size` bytes."""
+    """Raise ArchiveError unless the bytes are an LZFSE stream that holds `size` bytes."""
     held = lzfse_size(archive, ref)
     if held != size:
         raise _broken(ref.path, f"holds {held} bytes; an image of its size has {size}")
 
 
 def lzfse_size(archive: ScanArchive, ref: ByteRange) -> int:
-    """How many bytes an LZFSE stream says it holds. Raises ArchiveError if it is none or cut off.
+    """Return how many bytes an LZFSE stream says it holds. Raises ArchiveError if it is none or cut off.
 
     The heads of its blocks are read only; see `lzfse_internal.h` of the reference implementation.
     """
@@ -68,7 +68,7 @@ def lzfse_size(archive: ScanArchive, ref: ByteRange) -> int:
 
 
 def read_npy_header(archive: ScanArchive, name: str) -> NpyHeader:
-    """Header of an array. Raises ArchiveError if it is none of two dimensions, of another type, or cut off."""
+    """Read the header of an array. Raises ArchiveError if it is none of two dimensions, of another type, or cut off."""
     data = archive.head(name, NPY_HEAD)
     if len(data) < 12 or not data.startswith(NPY_MAGIC) or data[6] not in (1, 2, 3):
         raise _broken(name, "is no NumPy array")

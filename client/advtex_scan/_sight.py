@@ -51,7 +51,7 @@ def check_sight(findings: Findings, manifest: ScanManifest, mesh: MeshSurface) -
 
 
 def _in_mesh_coordinates(manifest: ScanManifest) -> tuple[FrameEntry, ...]:
-    """The frames as seen from the mesh's own coordinates."""
+    """Return the frames as seen from the mesh's own coordinates."""
     if manifest.mesh is None or manifest.mesh.mesh_to_world == IDENTITY:
         return manifest.frames
     to_mesh = invert_rigid(manifest.mesh.mesh_to_world)
@@ -59,7 +59,7 @@ def _in_mesh_coordinates(manifest: ScanManifest) -> tuple[FrameEntry, ...]:
 
 
 def spread_points(mesh: MeshSurface, count: int) -> list[Vector]:
-    """About `count` points on the mesh, spread by area over at most SAMPLED_TRIANGLES of its triangles."""
+    """Return about `count` points on the mesh, spread by area over at most SAMPLED_TRIANGLES of its triangles."""
     triangles = range(0, mesh.facts.faces, -(-mesh.facts.faces // SAMPLED_TRIANGLES))
     ends = list(accumulate(mesh.area(triangle) for triangle in triangles))
     points = []
@@ -81,7 +81,7 @@ def spread_points(mesh: MeshSurface, count: int) -> list[Vector]:
 
 
 def sees(frame: FrameEntry, points: list[Vector]) -> bool:
-    """Whether any of the world points projects into the color image, in front of the camera."""
+    """Tell whether any of the world points projects into the color image, in front of the camera."""
     r0, r1, r2, _ = invert_rigid(frame.camera_to_world)
     K = frame.color_intrinsics
     for x, y, z in points:

@@ -16,7 +16,7 @@ class FileSource:
         self.size = os.fstat(self._file.fileno()).st_size
 
     def read(self, length: int, offset: int) -> bytes:
-        """`length` bytes from `offset`, fewer only at the end of the file."""
+        """Return `length` bytes from `offset`, fewer only at the end of the file."""
         pieces = []
         with self._lock:
             self._file.seek(offset)

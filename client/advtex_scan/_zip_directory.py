@@ -56,7 +56,7 @@ class _Entry:
 
 
 def read_directory(source: FileSource, label: str, limits: ArchiveLimits) -> dict[str, Extent]:
-    """All files of the zip by name, folders and operating systems' junk left out.
+    """Return all files of the zip by name, without folders and operating systems' junk.
 
     Raises ArchiveError with every problem that was found in the directory.
     """
@@ -78,7 +78,7 @@ def read_directory(source: FileSource, label: str, limits: ArchiveLimits) -> dic
 
 
 def too_many_entries(label: str, limits: ArchiveLimits) -> LimitError:
-    """The error for an archive with more entries than allowed."""
+    """Return the error for an archive with more entries than allowed."""
     message = f"holds more than {limits.entries} entries"
     return LimitError(Finding("error", "too_many_entries", label, message, "leave out what is no part of the scan"))
 
@@ -109,7 +109,7 @@ def _exactly(source: FileSource, label: str, length: int, offset: int) -> bytes:
 
 
 def _find_directory(source: FileSource, label: str) -> tuple[int, int, int]:
-    """Start, size in bytes and stated number of entries of the central directory."""
+    """Return the start, size in bytes and stated number of entries of the central directory."""
     end = source.size
     tail_start = max(0, end - END.size - U16)
     tail = source.read(end - tail_start, tail_start)
@@ -160,7 +160,7 @@ def _entries(source: FileSource, label: str, start: int, size: int) -> Iterator[
 
 
 def _decode(raw: bytes, flags: int) -> str:
-    """UTF-8 where flagged; some tools write it without the flag, so it is tried before code page 437."""
+    """Decode as UTF-8 where flagged; some tools write it without the flag, so it is tried before code page 437."""
     try:
         return raw.decode("utf-8")
     except UnicodeDecodeError:

@@ -43,21 +43,21 @@ class ScanArchive(ABC):
         self._sizes = {name.removeprefix(self._prefix): sizes[name] for name in sorted(sizes)}
 
     def names(self) -> tuple[str, ...]:
-        """Relative paths of all files, sorted, with `/` as separator."""
+        """Return the relative paths of all files, sorted, with `/` as separator."""
         return tuple(self._sizes)
 
     def __contains__(self, name: object) -> bool:
         return name in self._sizes
 
     def size(self, name: str) -> int:
-        """Size of a file in bytes."""
+        """Return the size of a file in bytes."""
         if name not in self._sizes:
             message = "is not in the scan" if name else "a file name is empty"
             raise ArchiveError(Finding("error", "missing_file", name, message, "add the file or correct the name"))
         return self._sizes[name]
 
     def stamps(self) -> list[tuple[str, int, int]]:
-        """Name, size and stamp of all files, sorted; a file that is changed later has another size or stamp.
+        """Return name, size and stamp of all files, sorted; a file that is changed later has another size or stamp.
 
         A stamp is the checksum of a zip's member or of a lone file, and the time of the last change, in nanoseconds, of
         a file in a folder.
@@ -65,12 +65,12 @@ class ScanArchive(ABC):
         return [(name, size, self._stamp(self._prefix + name)) for name, size in self._sizes.items()]
 
     def open(self, name: str) -> BinaryIO:
-        """A buffered stream over a file from its first byte; the caller closes it."""
+        """Return a buffered stream over a file from its first byte; the caller closes it."""
         self.size(name)
         return cast(BinaryIO, io.BufferedReader(self._stream(self._prefix + name), 1 << 16))
 
     def read(self, ref: FileRef, limit: int = READ_LIMIT) -> bytes:
-        """A whole file or byte range; LimitError if it is longer than `limit` bytes."""
+        """Return a whole file or byte range. Raises LimitError if it is longer than `limit` bytes."""
         length = ref.length if isinstance(ref, ByteRange) else self.size(ref)
         name = ref.path if isinstance(ref, ByteRange) else ref
         if length > limit:
@@ -85,13 +85,13 @@ class ScanArchive(ABC):
         return data
 
     def head(self, ref: FileRef, length: int) -> bytes:
-        """The first `length` bytes of a file or byte range, fewer if it is shorter."""
+        """Return the first `length` bytes of a file or byte range, fewer if it is shorter."""
         if isinstance(ref, ByteRange):
             return self.read_range(ref.path, ref.offset, min(length, ref.length))
         return self.read_range(ref, 0, min(length, self.size(ref)))
 
     def tail(self, ref: FileRef, length: int) -> bytes:
-        """The last `length` bytes of a file or byte range, fewer if it is shorter."""
+        """Return the last `length` bytes of a file or byte range, fewer if it is shorter."""
         if isinstance(ref, ByteRange):
             length = min(length, ref.length)
             return self.read_range(ref.path, ref.offset + ref.length - length, length)
@@ -99,7 +99,7 @@ class ScanArchive(ABC):
         return self.read_range(ref, self.size(ref) - length, length)
 
     def read_range(self, name: str, offset: int, length: int) -> bytes:
-        """`length` bytes from `offset` of a file; reading ranges in rising order passes over the file once."""
+        """Return `length` bytes from `offset` of a file; reading ranges in rising order passes over the file once."""
         size = self.size(name)
         if offset < 0 or length < 0 or offset + length > size:
             message = f"is {size} bytes long, but bytes {offset} to {offset + length} are needed"
@@ -214,7 +214,7 @@ class _FolderArchive(ScanArchive):
         super().__init__(path, sizes)
 
     def close(self) -> None:
-        """A folder holds nothing open."""
+        """Do nothing: a folder holds nothing open."""
 
     def _stamp(self, name: str) -> int:
         try:
@@ -258,7 +258,7 @@ def _leaves(name: str) -> Finding:
 
 
 def _walk(root: Path, label: str, limits: ArchiveLimits, problems: Findings) -> list[tuple[str, int]]:
-    """Names and sizes of all plain files below `root`; links are followed only to files inside it."""
+    """Return names and sizes of all plain files below `root`; links are followed only to files inside it."""
     found: list[tuple[str, int]] = []
     for folder, subfolders, files in os.walk(root, onerror=_unreadable_folder):
         base = Path(folder)

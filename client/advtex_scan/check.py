@@ -54,11 +54,11 @@ class CheckReport:
 
     @property
     def ok(self) -> bool:
-        """True if the scan can be textured: nothing of severity `error` was found."""
+        """The scan can be textured: nothing of severity `error` was found."""
         return not any(finding.severity == "error" for finding in self.findings)
 
     def to_dict(self) -> dict[str, Any]:
-        """The report as JSON-ready values, `ok` included."""
+        """Return the report as JSON-ready values, `ok` included."""
         return {
             "ok": self.ok,
             "layout": self.layout,
@@ -73,7 +73,7 @@ class CheckReport:
         }
 
     def format_text(self) -> str:
-        """The report for people, without a final line break."""
+        """Return the report for people, without a final line break."""
         found = f"{self.layout}, {self.sureness:.0%} sure: {self.why}" if self.layout else "not recognized"
         lines = [f"layout   {found}"]
         lines.append(f"frames   {self.frames_usable} usable of {self.frames_found}{_left_out(self.dropped)}")

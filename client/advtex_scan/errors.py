@@ -35,7 +35,7 @@ class Finding:
 
 
 class ScanFormatError(Exception):
-    """Base of all errors of this package. The message joins the findings, each with its file and remedy."""
+    """The base of all errors of this package. The message joins the findings, each with its file and remedy."""
 
     def __init__(self, *findings: Finding) -> None:
         super().__init__("; ".join(map(str, findings)))
@@ -97,22 +97,22 @@ class Findings:
             self.add(finding)
 
     def error(self, code: str, where: str, message: str, remedy: str) -> None:
-        """Something that must be mended before the scan can be textured."""
+        """Add something that must be mended before the scan can be textured."""
         self.add(Finding("error", code, where, message, remedy))
 
     def warning(self, code: str, where: str, message: str, remedy: str) -> None:
-        """Something that the user should look at; the scan can be textured."""
+        """Add something that the user should look at; the scan can be textured."""
         self.add(Finding("warning", code, where, message, remedy))
 
     def info(self, code: str, where: str, message: str, remedy: str = "") -> None:
-        """Something that was assumed or left out."""
+        """Add something that was assumed or left out."""
         self.add(Finding("info", code, where, message, remedy))
 
     def count(self, code: str) -> int:
-        """How many findings with this code were added."""
+        """Return how many findings with this code were added."""
         return sum(len(group.places) for (_, known, _), group in self._groups.items() if known == code)
 
     def result(self) -> tuple[Finding, ...]:
-        """All groups, errors first, each in the order of its first finding."""
+        """Return all groups, errors first, each in the order of its first finding."""
         findings = (group.joined() for group in self._groups.values())
         return tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))

@@ -39,7 +39,7 @@ class ImageHeader:
 
 
 def place(ref: FileRef | VideoFrame) -> str:
-    """The file of a reference, with the position for a member of a stream or video."""
+    """Name the file of a reference, with the position for a member of a stream or video."""
     if isinstance(ref, str):
         return ref
     if isinstance(ref, VideoFrame):
@@ -48,7 +48,7 @@ def place(ref: FileRef | VideoFrame) -> str:
 
 
 def read_image_header(archive: ScanArchive, ref: FileRef) -> ImageHeader:
-    """Header of a PNG or JPEG. Raises ImageError if it is none, cut off, or larger than MAX_PIXELS."""
+    """Read the header of a PNG or JPEG. Raises ImageError if it is none, cut off, or larger than MAX_PIXELS."""
     data = archive.head(ref, FIRST_BYTES)
     header = parse_image_header(data, place(ref))
     if header is None and len(data) == FIRST_BYTES:
@@ -62,26 +62,26 @@ def read_image_header(archive: ScanArchive, ref: FileRef) -> ImageHeader:
 
 
 def check_end(archive: ScanArchive, ref: FileRef, header: ImageHeader) -> None:
-    """Raises ImageError if the image is cut off. Reads the tail, and the whole file only if the end is not there."""
+    """Raise ImageError if the image is cut off. The tail is read, and the whole file only if the end is not there."""
     if not has_end(archive.tail(ref, LAST_BYTES), header) and not has_end(archive.read(ref), header):
         raise cut_off(place(ref))
 
 
 def has_end(data: bytes, header: ImageHeader) -> bool:
-    """Whether an image that ends with `data` is whole; decoders fill with gray what is missing, and say nothing."""
+    """Tell whether an image that ends with `data` is whole; decoders fill what is missing with gray and say nothing."""
     if header.format == "png":
         return data.rfind(b"IEND") > data.rfind(b"IDAT")
     return data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")  # end of image after the last start of scan
 
 
 def cut_off(where: str) -> ImageError:
-    """The error for an image without its end."""
+    """Return the error for an image without its end."""
     remedy = "copy the file again in full, or leave the frame out"
     return ImageError(Finding("error", "truncated_image", where, "is cut off: its end is missing", remedy))
 
 
 def parse_image_header(data: bytes, where: str) -> ImageHeader | None:
-    """Header of the image that starts with `data`; None if more bytes are needed. Raises ImageError if it is none."""
+    """Read the header of the image that starts with `data`; None if more is needed. Raises ImageError if it is none."""
     if data.startswith(PNG_SIGNATURE):
         return _png(data, where)
     if data.startswith(b"\xff\xd8"):

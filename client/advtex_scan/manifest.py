@@ -58,7 +58,7 @@ class Intrinsics:
             raise ValueError(f"focal lengths and sizes must be positive: {self}")
 
     def scaled(self, width: int, height: int) -> Intrinsics:
-        """The same camera with its image resampled to width x height pixels."""
+        """Return the same camera with its image resampled to width x height pixels."""
         sx, sy = width / self.width, height / self.height
         return Intrinsics(self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, width, height, self.distortion)
 

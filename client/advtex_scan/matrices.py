@@ -12,27 +12,27 @@ ROTATION_TOLERANCE = 0.01  # largest entry of |R Rᵀ - I|; six printed digits (
 
 
 def matrix4(values: Sequence[float]) -> Matrix4:
-    """A matrix from 16 numbers, row by row, or from the 12 of its upper three rows."""
+    """Return a matrix from 16 numbers, row by row, or from the 12 of its upper three rows."""
     full = [*values, 0.0, 0.0, 0.0, 1.0] if len(values) == 12 else list(values)
     assert len(full) == 16
     return cast(Matrix4, tuple(tuple(float(value) for value in full[row : row + 4]) for row in range(0, 16, 4)))
 
 
 def says_nothing(values: Sequence[float]) -> bool:
-    """Whether 16 numbers are the identity, or all 0, as some writers leave a matrix that they do not know."""
+    """Tell whether 16 numbers are the identity, or all 0, as some writers leave a matrix that they do not know."""
     unit = [value for row in IDENTITY for value in row]
     return not any(values) or all(abs(a - b) <= 1e-6 for a, b in zip(values, unit, strict=True))
 
 
 def compose(a: Matrix4, b: Matrix4) -> Matrix4:
-    """a @ b: first b, then a."""
+    """Return a @ b: first b, then a."""
     columns = list(zip(*b, strict=True))
     rows = [[sum(x * y for x, y in zip(row, column, strict=True)) for column in columns] for row in a]
     return matrix4([value for row in rows for value in row])
 
 
 def invert_rigid(transform: Matrix4) -> Matrix4:
-    """Inverse of a rotation and translation: Rᵀ, -Rᵀ t."""
+    """Return the inverse of a rotation and translation: Rᵀ, -Rᵀ t."""
     rotation = [row[:3] for row in transform[:3]]
     shift = [row[3] for row in transform[:3]]
     values: list[float] = []
@@ -42,12 +42,12 @@ def invert_rigid(transform: Matrix4) -> Matrix4:
 
 
 def opencv_axes(pose: Matrix4) -> Matrix4:
-    """A camera_to_world whose camera axes are OpenGL's and ARKit's (y up, z backward), with OpenCV's; same world."""
+    """Turn a camera_to_world from OpenGL's and ARKit's camera axes (y up, z backward) to OpenCV's; same world."""
     return matrix4([sign * value for row in pose for sign, value in zip((1, -1, -1, 1), row, strict=True)])
 
 
 def from_quaternion(x: float, y: float, z: float, w: float, shift: Sequence[float]) -> Matrix4:
-    """The rotation of a unit quaternion, then `shift`; a quaternion of another length gives no rotation."""
+    """Return the rotation of a unit quaternion, then `shift`; a quaternion of another length gives no rotation."""
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), shift[0]),
         (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), shift[1]),
@@ -57,7 +57,7 @@ def from_quaternion(x: float, y: float, z: float, w: float, shift: Sequence[floa
 
 
 def from_rotation_vector(vector: Sequence[float], shift: Sequence[float]) -> Matrix4:
-    """The rotation by |vector| radians about `vector`, then `shift`; NaN for a vector without a length."""
+    """Return the rotation by |vector| radians about `vector`, then `shift`; NaN for a vector without a length."""
     angle = math.hypot(*vector)
     if not math.isfinite(angle):
         return matrix4([math.nan] * 12)
@@ -67,7 +67,7 @@ def from_rotation_vector(vector: Sequence[float], shift: Sequence[float]) -> Mat
 
 
 def pose_problem(transform: Matrix4) -> str | None:
-    """Why a matrix is no rigid transform, None if it is one within ROTATION_TOLERANCE."""
+    """Return why a matrix is no rigid transform, None if it is one within ROTATION_TOLERANCE."""
     if not all(math.isfinite(value) for row in transform for value in row):
         return "the pose holds NaN or infinite numbers"
     if any(abs(x - y) > 1e-3 for x, y in zip(transform[3], (0, 0, 0, 1), strict=True)):
@@ -83,12 +83,12 @@ def pose_problem(transform: Matrix4) -> str | None:
 
 
 def is_lost(transform: Matrix4) -> bool:
-    """True for the mark of lost tracking (ScanNet, BundleFusion): nothing in the upper rows is finite."""
+    """Tell whether this is the mark of lost tracking (ScanNet, BundleFusion): nothing in the upper rows is finite."""
     return not any(math.isfinite(value) for row in transform[:3] for value in row)
 
 
 def up_axis_of(poses: Iterable[Matrix4]) -> UpAxis:
-    """The world axis nearest to where camera_to_world poses (OpenCV axes) have their upper side on average.
+    """Return the world axis nearest to where camera_to_world poses (OpenCV axes) have their upper side on average.
 
     For layouts whose world has no stated up direction: people hold a camera upright more often than not. "+z" without a
     finite pose.

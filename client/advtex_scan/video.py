@@ -39,7 +39,7 @@ class _Track:
 
 
 def read_video_header(archive: ScanArchive, name: str) -> VideoHeader:
-    """Header of a video. Raises ArchiveError if it is none, cut off, or without pictures."""
+    """Read the header of a video. Raises ArchiveError if it is none, cut off, or without pictures."""
     tracks: list[_Track] = []
     for kind, body in _boxes(_description(archive, name)):
         if kind == b"trak":
@@ -53,7 +53,7 @@ def read_video_header(archive: ScanArchive, name: str) -> VideoHeader:
 
 
 def _description(archive: ScanArchive, name: str) -> bytes:
-    """The body of `moov`."""
+    """Return the body of `moov`."""
     offset, size = 0, archive.size(name)
     for _ in range(MOST_BOXES):
         if offset + 16 > size:
@@ -72,7 +72,7 @@ def _description(archive: ScanArchive, name: str) -> bytes:
 
 
 def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """All boxes below `data`, each before those inside it; ends silently at one that makes no sense."""
+    """Yield all boxes below `data`, each before those inside it; this ends silently at one that makes no sense."""
     stack = [(0, len(data))]
     for _ in range(MOST_BOXES):
         while stack and stack[-1][0] + 8 > stack[-1][1]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -249,6 +250,31 @@ def test_the_async_client_goes_on_too(server: FakeServer, scan: Path, monkeypatc
     assert server.received == server.uploads["u0"].size
 
 
+def test_an_async_submission_that_is_canceled_gives_its_locks_back(
+    server: FakeServer, scan: Path, tmp_path: Path
+) -> None:
+    async def hangs(request: httpx.Request) -> httpx.Response:
+        await request.aread()
+        if request.method == "PATCH":
+            await anyio.sleep_forever()
+        return server.handle(request)
+
+    async def main() -> None:
+        transport = httpx.MockTransport(hangs)
+        async with AsyncClient(URL, "k", transport=transport) as client, anyio.create_task_group() as tasks:
+            tasks.start_soon(client.submit, scan)
+            while not server.uploads:
+                await anyio.sleep(0.01)
+            tasks.cancel_scope.cancel()
+
+    anyio.run(main)
+    locks = list((tmp_path / "state").rglob("*.lock"))
+    assert len(locks) == 2, "the submission's and the upload's"
+    for lock in locks:
+        with lock.open("a") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
 def test_new_makes_another_job_from_the_same_upload(server: FakeServer, client: Client, scan: Path) -> None:
     first = client.submit(scan)
     second = client.submit(scan, new=True)
@@ -415,13 +441,6 @@ def test_pages_are_fetched_as_they_are_needed() -> None:
         assert next(pages).id == "j0"
         assert asked == [None]
         assert [job.id for job in pages] == ["j1", "j2"]
-
-
-def test_both_clients_have_the_same_methods() -> None:
-    def public(kind: type) -> set[str]:
-        return {name for name in vars(kind) if not name.startswith("_")}
-
-    assert public(Client) == public(AsyncClient)
 
 
 def test_the_async_client_submits_watches_and_fetches(server: FakeServer, scan: Path, tmp_path: Path) -> None:

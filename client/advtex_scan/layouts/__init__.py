@@ -52,6 +52,6 @@ __all__ = ["LAYOUTS", "LAYOUT_NAMES", "Layout", "Match", "ScanReader", "matching
 
 
 def matching_layouts(archive: ScanArchive) -> list[tuple[Layout, Match]]:
-    """The layouts that an archive may be of and what each saw, the surest first."""
+    """Return the layouts that an archive may be of and what each saw, the surest first."""
     matches = [(layout, match) for layout in LAYOUTS if (match := layout.detect(archive))]
     return sorted(matches, key=lambda pair: pair[1].score, reverse=True)

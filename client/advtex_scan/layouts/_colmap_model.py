@@ -69,13 +69,13 @@ class ModelImage:
 
 
 def read_cameras(archive: ScanArchive, path: str) -> dict[int, ModelCamera]:
-    """Cameras by id. Raises ArchiveError if the file is broken."""
+    """Return the cameras by id. Raises ArchiveError if the file is broken."""
     with archive.open(path) as stream:
         return dict(_binary_cameras(stream, path) if path.endswith(".bin") else _text_cameras(stream, path))
 
 
 def read_images(archive: ScanArchive, path: str) -> Iterator[ModelImage]:
-    """Images in the order of the file. Raises ArchiveError where the file is broken."""
+    """Yield the images in the order of the file. Raises ArchiveError where the file is broken."""
     with archive.open(path) as stream:
         yield from _binary_images(stream, path) if path.endswith(".bin") else _text_images(stream, path)
 
@@ -159,7 +159,7 @@ def _text_images(stream: BinaryIO, path: str) -> Iterator[ModelImage]:
 
 
 def _lines(stream: BinaryIO, path: str) -> Iterator[str]:
-    """Lines, cut off at MAX_LINE; the points of an image fill long ones."""
+    """Yield the lines, cut off at MAX_LINE; the points of an image fill long ones."""
     entries = 0
     while line := stream.readline(MAX_LINE):
         rest = line

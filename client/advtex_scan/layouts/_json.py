@@ -13,7 +13,7 @@ JSON_LIMIT = 16 << 20
 
 
 def json_object(reader: ScanReader, name: str, remedy: str = "export it again") -> Mapping[str, Any] | None:
-    """The object in a JSON file; None, with a finding and its remedy, if there is none."""
+    """Return the object in a JSON file; None, with a finding and its remedy, if there is none."""
     reader.used.add(name)
     try:
         value = json.loads(reader.archive.read(name, JSON_LIMIT))
@@ -30,7 +30,7 @@ def json_object(reader: ScanReader, name: str, remedy: str = "export it again") 
 
 
 def json_number(value: Any) -> float | None:
-    """A JSON number as a float; None for anything else, integers beyond the floats included."""
+    """Return a JSON number as a float; None for anything else, integers beyond the floats included."""
     if not isinstance(value, int | float) or isinstance(value, bool):
         return None
     try:
@@ -40,7 +40,7 @@ def json_number(value: Any) -> float | None:
 
 
 def json_numbers(value: Any, count: int) -> list[float] | None:
-    """`count` numbers from a list; None for anything else."""
+    """Return `count` numbers from a list; None for anything else."""
     if not isinstance(value, list) or len(value) != count:
         return None
     numbers = [json_number(entry) for entry in value]
@@ -48,7 +48,7 @@ def json_numbers(value: Any, count: int) -> list[float] | None:
 
 
 def json_size(width: Any, height: Any) -> tuple[int, int] | None:
-    """An image size; None unless both are positive whole numbers of at most six digits."""
+    """Return an image size; None unless both are positive whole numbers of at most six digits."""
     numbers = [json_number(width), json_number(height)]
     if not all(number is not None and number.is_integer() and 0 < number < 10**6 for number in numbers):
         return None

@@ -15,7 +15,7 @@ FACES = re.compile(rb"^element face +0*[1-9]", re.MULTILINE)
 
 
 def choose_mesh(reader: ScanReader, documented: tuple[str, ...]) -> MeshEntry | None:
-    """The first of the layout's documented names that exists, else the one `mesh.*`, else the only mesh file.
+    """Choose the first of the layout's documented names that exists, else the one `mesh.*`, else the only mesh file.
 
     Several that are equally good are an error that lists them; none is left to the check to report. A PLY without
     faces is a point cloud and no mesh.
@@ -39,7 +39,7 @@ def choose_mesh(reader: ScanReader, documented: tuple[str, ...]) -> MeshEntry | 
 
 
 def _only_points(archive: ScanArchive, name: str) -> bool:
-    """Whether a file starts with a whole PLY header that has no faces; broken ones are left to the mesh's reader."""
+    """Tell whether a file starts with a whole PLY header without faces; broken ones are left to the mesh's reader."""
     if not name.lower().endswith(".ply"):
         return False
     try:

@@ -35,11 +35,11 @@ class Layout(Protocol):
     NAME: str
 
     def detect(self, archive: ScanArchive) -> Match | None:
-        """Whether the names (and heads) of the files are of this layout; never raises."""
+        """Tell whether the names (and heads) of the files are of this layout; this never raises."""
         ...
 
     def read(self, reader: ScanReader) -> ScanManifest | None:
-        """All frames that have a color image and a pose; None if there is nothing to build on."""
+        """Return all frames that have a color image and a pose; None if there is nothing to build on."""
         ...
 
 
@@ -56,7 +56,7 @@ class ScanReader:
         self._videos: dict[str, VideoHeader | None] = {}
 
     def text(self, name: str, limit: int = TEXT_LIMIT) -> str | None:
-        """A text file of at most `limit` bytes; None, with a finding, if it cannot be read."""
+        """Return a text file of at most `limit` bytes; None, with a finding, if it cannot be read."""
         self.used.add(name)
         try:
             return self.archive.read(name, limit).decode("utf-8", "replace")
@@ -65,7 +65,7 @@ class ScanReader:
             return None
 
     def numbers(self, name: str, counts: tuple[int, ...]) -> list[float] | None:
-        """The numbers of a text file, as many as one of `counts`; None, with a finding, otherwise."""
+        """Return the numbers of a text file, as many as one of `counts`; None, with a finding, otherwise."""
         text = self.text(name)
         if text is None:
             return None
@@ -78,7 +78,7 @@ class ScanReader:
         return values
 
     def pose(self, values: list[float], where: str) -> Matrix4 | None:
-        """A rigid 4x4 from 12 or 16 numbers; None if tracking was lost (dropped, counted) or it is no rotation."""
+        """Return a rigid 4x4 from 12 or 16 numbers; None if tracking was lost (dropped, counted) or it is none."""
         transform = matrix4(values)
         if is_lost(transform):
             remedy = "nothing to do unless many frames are lost"
@@ -92,12 +92,12 @@ class ScanReader:
         return transform
 
     def pose_file(self, name: str) -> Matrix4 | None:
-        """The pose in a text file of 4x4 (or 3x4) numbers."""
+        """Return the pose in a text file of 4x4 (or 3x4) numbers."""
         values = self.numbers(name, (16, 12))
         return None if values is None else self.pose(values, name)
 
     def rigid_file(self, name: str) -> Matrix4 | None:
-        """A fixed transform between two cameras."""
+        """Return a fixed transform between two cameras."""
         values = self.numbers(name, (16, 12))
         if values is None:
             return None
@@ -114,7 +114,7 @@ class ScanReader:
         self.findings.warning(reason, where, message, remedy)
 
     def video(self, name: str) -> VideoHeader | None:
-        """What a video says of its pictures; None, with one finding for all of its frames, if it cannot be read."""
+        """Read what a video says of its pictures; None, with one finding for all frames, if it cannot be read."""
         if name not in self._videos:
             self.used.add(name)
             try:
@@ -125,7 +125,7 @@ class ScanReader:
         return self._videos[name]
 
     def image_size(self, refs: list[FileRef]) -> tuple[int, int] | None:
-        """Width and height that most of a few images have; None if no image has a sound header.
+        """Return the width and height that most of a few images have; None if no image has a sound header.
 
         The check of each frame reports the images that differ or are broken.
         """
@@ -141,7 +141,7 @@ class ScanReader:
         return sizes.most_common(1)[0][0] if sizes else None
 
     def color_size(self, refs: list[FileRef]) -> tuple[int, int] | None:
-        """As `image_size`; if no image is sound, no frame will be checked, so all of them are reported here."""
+        """Do as `image_size`; if no image is sound, no frame will be checked, so all of them are reported here."""
         size = self.image_size(refs)
         for ref in refs if size is None else ():
             try:
@@ -151,7 +151,7 @@ class ScanReader:
         return size
 
     def matrix_intrinsics(self, name: str, size: tuple[int, int] | None) -> Intrinsics | None:
-        """Intrinsics from a 3x3 or 4x4 matrix file that counts the first pixel's centre as (0, 0)."""
+        """Return intrinsics from a 3x3 or 4x4 matrix file that counts the first pixel's centre as (0, 0)."""
         values = self.numbers(name, (9, 16))
         if values is None or size is None:
             return None
@@ -161,14 +161,14 @@ class ScanReader:
     def opencv_intrinsics(
         self, fx_fy_cx_cy: tuple[float, float, float, float], size: tuple[int, int], where: str
     ) -> Intrinsics | None:
-        """Intrinsics whose principal point counts the first pixel's centre as (0, 0)."""
+        """Return intrinsics whose principal point counts the first pixel's centre as (0, 0)."""
         fx, fy, cx, cy = fx_fy_cx_cy
         return self.intrinsics((fx, fy, cx + OPENCV_OFFSET, cy + OPENCV_OFFSET), size, where)
 
     def intrinsics(
         self, fx_fy_cx_cy: tuple[float, float, float, float], size: tuple[int, int], where: str
     ) -> Intrinsics | None:
-        """Checked intrinsics; None, with a finding, if they describe no camera."""
+        """Return checked intrinsics; None, with a finding, if they describe no camera."""
         fx, fy, cx, cy = fx_fy_cx_cy
         width, height = size
         if not (all(map(math.isfinite, fx_fy_cx_cy)) and fx > 0 and fy > 0 and width > 0 and height > 0):
@@ -182,7 +182,7 @@ class ScanReader:
 
 
 def parse_numbers(text: str) -> list[float] | None:
-    """All numbers of a text, separated by blanks, commas or semicolons; None if anything else is in it."""
+    """Return all numbers of a text, separated by blanks, commas or semicolons; None if anything else is in it."""
     text = re.sub(r"1\.#INF\d*", "inf", re.sub(r"1\.#(?:IND|QNAN|SNAN)\d*", "nan", text))  # as old Windows tools print
     try:
         return [float(word) for word in re.split(r"[\s,;]+", text.strip()) if word]
@@ -191,13 +191,13 @@ def parse_numbers(text: str) -> list[float] | None:
 
 
 def parse_size(width: str, height: str) -> tuple[int, int] | None:
-    """An image size from two words; None if they are no positive numbers of at most six digits."""
+    """Return an image size from two words; None if they are no positive numbers of at most six digits."""
     if not all(word.isascii() and word.isdecimal() and len(word) <= 6 and int(word) > 0 for word in (width, height)):
         return None
     return int(width), int(height)
 
 
 def parse_settings(text: str, separator: str = "=") -> dict[str, str]:
-    """Lines of the form `key = value`."""
+    """Read lines of the form `key = value`."""
     pairs = (line.split(separator, 1) for line in text.splitlines() if separator in line)
     return {key.strip(): value.strip() for key, value in pairs}

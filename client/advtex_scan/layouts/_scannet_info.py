@@ -25,7 +25,7 @@ class SceneInfo:
 
 
 def read_scene_info(reader: ScanReader) -> SceneInfo:
-    """The first text file at the top that holds one of MARKS; empty if there is none."""
+    """Read the first text file at the top that holds one of MARKS; empty if there is none."""
     for name in reader.archive.names():
         if "/" in name or not name.endswith(".txt") or reader.archive.size(name) > TEXT_LIMIT:
             continue
@@ -38,7 +38,7 @@ def read_scene_info(reader: ScanReader) -> SceneInfo:
 
 
 def documented_meshes(reader: ScanReader) -> tuple[str, ...]:
-    """ScanNet's own mesh names: the decimated one before the full one, since a texture needs no more of it."""
+    """Return ScanNet's own mesh names, the decimated one first, since a texture needs no more of it."""
     return tuple(name for suffix in MESHES for name in reader.archive.names() if name.endswith(suffix))
 
 

@@ -29,7 +29,7 @@ class Pinhole:
     distortion: Distortion | None = None
 
     def intrinsics(self) -> Intrinsics:
-        """The same with the image's corner at (0, 0)."""
+        """Return the same with the image's corner at (0, 0)."""
         fx, fy, cx, cy = self.fx_fy_cx_cy
         return Intrinsics(fx, fy, cx + OPENCV_OFFSET, cy + OPENCV_OFFSET, *self.size, self.distortion)
 
@@ -38,39 +38,39 @@ PRIMESENSE = Pinhole((525.0, 525.0, 319.5, 239.5), (640, 480))
 
 
 def natural_key(name: str) -> tuple[str, ...]:
-    """Sorts names as their numbers go: 2 before 10."""
+    """Return what sorts names as their numbers go: 2 before 10."""
     return tuple(part.zfill(NUMBER_DIGITS) if part.isdecimal() else part for part in re.split(r"(\d+)", name))
 
 
 def by_name(frames: Iterable[FrameEntry]) -> tuple[FrameEntry, ...]:
-    """Frames in the order of their names, as a manifest has them."""
+    """Return frames in the order of their names, as a manifest has them."""
     return tuple(sorted(frames, key=lambda frame: frame.name))
 
 
 def frame_name(path: str) -> str:
-    """The image's name without folder and suffix, its numbers padded, so that names sort as their numbers go."""
+    """Return the image's name without folder and suffix, its numbers padded, so that names sort as their numbers go."""
     return padded(PurePosixPath(path).stem)
 
 
 def padded(name: str) -> str:
-    """A name with its numbers in at least six digits."""
+    """Return a name with its numbers in at least six digits."""
     return re.sub(r"\d+", lambda match: match[0].zfill(NAME_DIGITS), name)
 
 
 def number_of(path: str) -> int | None:
-    """The first number in a file's name."""
+    """Return the first number in a file's name."""
     match = re.search(r"[0-9]{1,18}", PurePosixPath(path).name)
     return int(match[0]) if match else None
 
 
 def images_in(archive: ScanArchive, folder: str) -> list[str]:
-    """The images directly in a folder (a path that ends in `/`, or empty), in the order of their numbers."""
+    """Return the images directly in a folder (a path that ends in `/`, or empty), in the order of their numbers."""
     found = [name for name in archive.names() if name.startswith(folder) and "/" not in name[len(folder) :]]
     return sorted((name for name in found if name.lower().endswith(IMAGE_SUFFIXES)), key=natural_key)
 
 
 def folder_of(archive: ScanArchive, *files: str) -> str | None:
-    """The folder that holds all of these files, the outermost if there are several; ends in `/` unless it is the top.
+    """Return the folder that holds all of these files, the outermost of several; it ends in `/` unless it is the top.
 
     Looked for by the first of the files.
     """
@@ -80,7 +80,7 @@ def folder_of(archive: ScanArchive, *files: str) -> str | None:
 
 
 def by_place(images: Sequence[str], numbers: Collection[int]) -> list[int | None]:
-    """Which of the numbers of a trajectory's poses is each image's.
+    """Return which of the numbers of a trajectory's poses is each image's.
 
     As many poses as images go in order, whatever they are numbered from. Otherwise a number is a place among the
     images, unless one of them is beyond the last: then the numbers in the images' names are meant.
@@ -94,7 +94,7 @@ def by_place(images: Sequence[str], numbers: Collection[int]) -> list[int | None
 
 
 def paired(colors: Sequence[str], depths: Sequence[str]) -> list[str | None]:
-    """The depth image of each image: in order if there are as many, else by the first number in their names."""
+    """Return the depth image of each image: in order if there are as many, else by the first number in their names."""
     if len(colors) == len(depths):
         return [*depths]
     by_number = {number_of(depth): depth for depth in reversed(depths)}
@@ -103,7 +103,7 @@ def paired(colors: Sequence[str], depths: Sequence[str]) -> list[str | None]:
 
 
 def nearest(times: Sequence[float], time: float, tolerance: float) -> int | None:
-    """Index of the nearest of sorted times; None if it is further away than `tolerance`."""
+    """Return the index of the nearest of sorted times; None if it is further away than `tolerance`."""
     after = bisect_left(times, time)
     around = [index for index in (after - 1, after) if 0 <= index < len(times)]
     best = min(around, key=lambda index: abs(times[index] - time), default=None)
@@ -124,7 +124,7 @@ class Track:
     tolerance: float
 
     def at(self, time: float) -> Matrix4 | None:
-        """The pose at a time; None if there is none near it."""
+        """Return the pose at a time; None if there is none near it."""
         after = bisect_left(self.times, time)
         if 0 < after < len(self.times) and self.times[after] - self.times[after - 1] <= self.gap:
             start, end = self.times[after - 1], self.times[after]
@@ -136,7 +136,7 @@ class Track:
 
 
 def blend(a: Matrix4, b: Matrix4, share: float) -> Matrix4:
-    """The pose `share` of the way from a to b, which are a small turn apart: entries blended, axes made orthonormal."""
+    """Return the pose `share` of the way from a to b, a small turn apart: entries blended, axes made orthonormal."""
     mixed = [
         [(1 - share) * x + share * y for x, y in zip(row_a, row_b, strict=True)]
         for row_a, row_b in zip(a[:3], b[:3], strict=True)
@@ -155,13 +155,13 @@ def _unit(vector: list[float]) -> list[float]:
 
 
 def list_lines(reader: ScanReader, name: str) -> list[str]:
-    """The lines of a list that say something: without comments and blank ones."""
+    """Return the lines of a list that say something: without comments and blank ones."""
     lines = (line.strip() for line in (reader.text(name, LIST_LIMIT) or "").splitlines())
     return [line for line in lines if line and not line.startswith("#")]
 
 
 def fitted(camera: Intrinsics | None, size: tuple[int, int] | None) -> Intrinsics | None:
-    """The camera for images of another resolution, where their shape is the same."""
+    """Return the camera for images of another resolution, where their shape is the same."""
     if camera is None or size is None:
         return camera
     shape = size[0] * camera.height / (size[1] * camera.width)

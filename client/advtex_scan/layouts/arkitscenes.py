@@ -36,14 +36,14 @@ _Stamped = tuple[list[float], list[str]]  # times, sorted, and the files of thes
 
 
 def detect(archive: ScanArchive) -> Match | None:
-    """`lowres_wide.traj` beside a folder of images."""
+    """Look for `lowres_wide.traj` beside a folder of images."""
     folder = folder_of(archive, POSE_FILE)
     kind = None if folder is None else _color_folder(archive, folder)
     return Match(0.9, f"{folder}{POSE_FILE} and {folder}{kind}/ are there") if kind else None
 
 
 def read(reader: ScanReader) -> ScanManifest | None:
-    """All images with a pose and intrinsics."""
+    """Read all images with a pose and intrinsics."""
     folder = folder_of(reader.archive, POSE_FILE)
     kind = None if folder is None else _color_folder(reader.archive, folder)
     if folder is None or kind is None:

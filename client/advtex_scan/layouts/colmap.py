@@ -32,13 +32,13 @@ UNIT_TOLERANCE = 0.01  # of a quaternion's length
 
 
 def detect(archive: ScanArchive) -> Match | None:
-    """`cameras.*` and `images.*` in one folder."""
+    """Look for `cameras.*` and `images.*` in one folder."""
     models = _models(archive)
     return Match(0.7, f"{models[0][0]} and {models[0][1].rpartition('/')[2]} are there") if models else None
 
 
 def read(reader: ScanReader) -> ScanManifest | None:
-    """All images of the model that are there."""
+    """Read all images of the model that are there."""
     models = _models(reader.archive)
     if not models:
         return None
@@ -65,7 +65,7 @@ def read(reader: ScanReader) -> ScanManifest | None:
 
 
 def _models(archive: ScanArchive) -> list[tuple[str, str]]:
-    """Camera and image files of all models, the one to be taken first."""
+    """Return the camera and image files of all models, the one to be taken first."""
     models = []
     folders = {name[: name.rfind("/") + 1] for name in archive.names()}
     for folder in sorted(folders):
@@ -94,7 +94,7 @@ def _report_models(reader: ScanReader, models: list[tuple[str, str]]) -> None:
 
 
 def _image_folder(archive: ScanArchive, image_file: str, images: list[ModelImage]) -> str:
-    """Where most of the first images are, searched from the model's folder upwards."""
+    """Return the folder where most of the first images are, searched from the model's folder upwards."""
     parts = image_file.split("/")[:-1]
     above = ["".join(f"{part}/" for part in parts[:count]) for count in range(len(parts), -1, -1)]
     folders = [start + folder for start in above for folder in IMAGE_FOLDERS]
@@ -135,7 +135,7 @@ def _pose(reader: ScanReader, image: ModelImage, where: str) -> Matrix4 | None:
 
 
 def _camera(reader: ScanReader, camera: ModelCamera, identity: int, path: str) -> Intrinsics | None:
-    """The pinhole and the distortion of a camera; None, with a finding, for models of other lenses."""
+    """Return the pinhole and the distortion of a camera; None, with a finding, for models of other lenses."""
     where, values = f"{path}: camera {identity}", camera.parameters
     if camera.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
         values = (values[0], *values)

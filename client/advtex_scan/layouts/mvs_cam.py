@@ -42,13 +42,13 @@ CAMERA_LINE = re.compile(
 
 
 def detect(archive: ScanArchive) -> Match | None:
-    """Any `.cam` file."""
+    """Look for any `.cam` file."""
     cams = [name for name in archive.names() if name.endswith(".cam")]
     return Match(0.8, f"{len(cams)} camera files end in .cam") if cams else None
 
 
 def read(reader: ScanReader) -> ScanManifest | None:
-    """All images with a `.cam`."""
+    """Read all images with a `.cam`."""
     cameras = _cameras(reader) if INTRINSICS_FILE in reader.archive else _config_cameras(reader)
     images = [name for name in reader.archive.names() if name.lower().endswith(IMAGE_SUFFIXES)]
     by_stem = {name.rsplit(".", 1)[0]: name for name in images}
@@ -118,7 +118,7 @@ def _cameras(reader: ScanReader) -> Cameras:
 
 
 def _config_cameras(reader: ScanReader) -> Cameras:
-    """What `Config/config.yml` says about each camera that it names; it is YAML of the flattest kind."""
+    """Read what `Config/config.yml` says about each camera that it names; it is YAML of the flattest kind."""
     text = reader.text(CONFIG_FILE) if CONFIG_FILE in reader.archive else None
     lines = (line.partition("#")[0] for line in (text or "").splitlines())
     settings = parse_settings("\n".join(lines), ":")
@@ -140,7 +140,7 @@ def _config_cameras(reader: ScanReader) -> Cameras:
 
 
 def _own_intrinsics(reader: ScanReader, lines: list[str], cam: str, color: str) -> Intrinsics | None:
-    """Second line of a `.cam`. mvs-texturing's image coordinates are (ppx, ppy) times the size, corner at (0, 0)."""
+    """Read the second line of a `.cam`: (ppx, ppy) times the size are image coordinates, with the corner at (0, 0)."""
     values = parse_numbers(lines[1]) if len(lines) > 1 else None
     if not values:
         remedy = f"add {INTRINSICS_FILE} with a line: color WIDTH HEIGHT fx F fy F cx C cy C"

@@ -76,12 +76,12 @@ Json = Mapping[str, Any]
 
 
 def detect(archive: ScanArchive) -> Match | None:
-    """A `scan.json` beside or above everything else."""
+    """Look for a `scan.json` beside or above everything else."""
     return Match(1.0, f"{FILE} is there") if FILE in archive else None
 
 
 def read(reader: ScanReader) -> ScanManifest | None:
-    """The manifest that `scan.json` describes; None if it is no JSON object of version 1."""
+    """Read the manifest that `scan.json` describes; None if it is no JSON object of version 1."""
     scan = _load(reader)
     if scan is None:
         return None
@@ -186,7 +186,7 @@ def _mesh(reader: ScanReader, scan: Json, mesh_to_world: Matrix4) -> MeshEntry |
 
 
 def _numbers(value: Any) -> list[float] | None:
-    """16 numbers from a flat or nested list; null becomes NaN."""
+    """Return 16 numbers from a flat or nested list; null becomes NaN."""
     if isinstance(value, list) and len(value) == 4 and all(isinstance(row, list) for row in value):
         value = [number for row in value for number in row]
     if not isinstance(value, list) or len(value) != 16:

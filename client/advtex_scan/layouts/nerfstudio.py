@@ -51,13 +51,13 @@ Json = Mapping[str, Any]
 
 
 def detect(archive: ScanArchive) -> Match | None:
-    """A `transforms.json`."""
+    """Look for a `transforms.json`."""
     folder = folder_of(archive, FILE)
     return None if folder is None else Match(0.85, f"{folder}{FILE} is there")
 
 
 def read(reader: ScanReader) -> ScanManifest | None:
-    """All frames with an image and a pose."""
+    """Read all frames with an image and a pose."""
     folder = folder_of(reader.archive, FILE)
     scan = json_object(reader, f"{folder}{FILE}")
     listed = scan.get("frames") if scan else None
@@ -92,7 +92,7 @@ class _Frame:
         self.common = scan
 
     def entry(self, applied: Matrix4) -> FrameEntry | None:
-        """The frame, with poses from before `applied`; None, with a finding, if it lacks anything."""
+        """Return the frame, with poses from before `applied`; None, with a finding, if it lacks anything."""
         color = self._file("file_path", IMAGE_SUFFIXES)
         if color is None:
             remedy = "add the image, or remove the frame"
@@ -117,7 +117,7 @@ class _Frame:
         return self.own.get(key, self.common.get(key))
 
     def _file(self, key: str, suffixes: tuple[str, ...] = ()) -> str | None:
-        """The file that a key names, with one of the suffixes if it has none."""
+        """Return the file that a key names, with one of the suffixes if it has none."""
         value = self.own.get(key)
         if not isinstance(value, str):
             return None
@@ -176,7 +176,7 @@ class _Frame:
         return Distortion(*values) if any(values) and all(map(math.isfinite, values)) else None
 
     def _depth(self) -> tuple[FileRef | None, tuple[int, int] | None]:
-        """The depth image and its size; None if there is none that can be used."""
+        """Return the depth image and its size; None if there is none that can be used."""
         name = self._file("depth_file_path") or self._file("depth_path")
         if name is None:
             return None, None
@@ -197,7 +197,7 @@ class _Frame:
 
 
 def _depth_scale(reader: ScanReader, scan: Json, frames: list[Any]) -> float:
-    """Units per metre. nerfstudio's key means millimetres, the others have their scale."""
+    """Return the units per metre. nerfstudio's key means millimetres, the others have their scale."""
     if not any(isinstance(frame, dict) and "depth_path" in frame for frame in frames):
         return MILLIMETRES
     given = next((scan[key] for key in SCALE_KEYS if scan.get(key) is not None), 1 / MILLIMETRES)

@@ -37,7 +37,7 @@ Files = dict[str, dict[str, str]]  # kind of file -> time -> path
 
 
 def detect(archive: ScanArchive) -> Match | None:
-    """Cameras with their images, below `keyframes/` or at the top."""
+    """Look for cameras with their images, below `keyframes/` or at the top."""
     files = _files(archive)
     for kind in ("corrected_", ""):
         shared = files.get(f"{kind}cameras", {}).keys() & files.get(f"{kind}images", {}).keys()
@@ -47,7 +47,7 @@ def detect(archive: ScanArchive) -> Match | None:
 
 
 def read(reader: ScanReader) -> ScanManifest | None:
-    """All keyframes; the uncorrected ones only if none is corrected."""
+    """Read all keyframes; the uncorrected ones only if none is corrected."""
     files = _files(reader.archive)
     reader.used.update(path for paths in files.values() for path in paths.values())
     kind = "corrected_" if files.get("corrected_cameras") else ""
@@ -103,7 +103,7 @@ def _report_uncorrected(reader: ScanReader, corrected: bool, files: Files) -> No
 
 
 def _camera(reader: ScanReader, name: str) -> tuple[Intrinsics, Matrix4, float | None] | None:
-    """The camera, its pose, and how sharp its image is."""
+    """Return the camera, its pose, and how sharp its image is."""
     given: Mapping[str, Any] | None = json_object(reader, name)
     if given is None:
         return None

@@ -33,7 +33,7 @@ Json = Mapping[str, Any]
 
 
 def detect(archive: ScanArchive) -> Match | None:
-    """`metadata` with `rgbd/<i>.jpg`."""
+    """Look for `metadata` with `rgbd/<i>.jpg`."""
     found = sum(1 for name in archive.names() if name.endswith(".jpg") and FILE.fullmatch(name))
     if not found or METADATA not in archive:
         return None
@@ -41,7 +41,7 @@ def detect(archive: ScanArchive) -> Match | None:
 
 
 def read(reader: ScanReader) -> ScanManifest | None:
-    """All images with a pose."""
+    """Read all images with a pose."""
     metadata = json_object(reader, METADATA)
     if metadata is None:
         return None
@@ -131,7 +131,7 @@ def _camera(reader: ScanReader, metadata: Json, index: int, size: tuple[int, int
 
 
 def _depth_size(reader: ScanReader, metadata: Json, size: tuple[int, int], depths: list[str]) -> tuple[int, int] | None:
-    """What `metadata` says, else what fits the number of values in the first depth image."""
+    """Return what `metadata` says, else what fits the number of values in the first depth image."""
     stated = json_size(metadata.get("dw"), metadata.get("dh"))
     if stated or not depths:
         return stated

@@ -45,14 +45,14 @@ REMEDY = "write `id id id+1` and the four rows of the camera-to-world matrix for
 
 
 def detect(archive: ScanArchive) -> Match | None:
-    """A folder of images and a trajectory."""
+    """Look for a folder of images and a trajectory."""
     folder = _color_folder(archive)
     trajectory = _trajectory_file(archive) if folder else None
     return Match(0.75, f"there are {folder} and the trajectory {trajectory}") if trajectory else None
 
 
 def read(reader: ScanReader) -> ScanManifest | None:
-    """All images with a pose."""
+    """Read all images with a pose."""
     folder, trajectory = _color_folder(reader.archive), _trajectory_file(reader.archive)
     if folder is None or trajectory is None:
         return None
@@ -84,7 +84,7 @@ def _color_folder(archive: ScanArchive) -> str | None:
 
 
 def _trajectory_file(archive: ScanArchive) -> str | None:
-    """The .log or json that starts like a trajectory: a documented name first, then the one nearest to the top."""
+    """Find the .log or json that starts like a trajectory: a documented name first, then the one nearest to the top."""
     names = sorted((name for name in archive.names() if name.count("/") <= 1), key=lambda name: (name.count("/"), name))
     logs = [name for name in names if name.lower().endswith(".log")]
     for name in [*(name for name in LOG_NAMES if name in archive), *logs[:FILES_LOOKED_AT]]:
@@ -104,7 +104,7 @@ def _head(archive: ScanArchive, name: str) -> str:
 
 
 def _log(reader: ScanReader, name: str) -> tuple[None, dict[int, Matrix4 | None]]:
-    """Camera-to-world poses by id; None where tracking was lost or the matrix is no pose, which is reported."""
+    """Return camera-to-world poses by id; None where tracking was lost or the matrix is no pose, which is reported."""
     lines = [line for line in (reader.text(name, LIST_LIMIT) or "").splitlines() if line.strip()]
     poses: dict[int, Matrix4 | None] = {}
     for start in range(0, min(len(lines), BLOCK * MAX_FRAMES), BLOCK):
@@ -122,7 +122,7 @@ def _log(reader: ScanReader, name: str) -> tuple[None, dict[int, Matrix4 | None]
 
 
 def _json_trajectory(reader: ScanReader, name: str) -> tuple[Intrinsics | None, dict[int, Matrix4 | None]]:
-    """The first frame's camera, and camera-to-world poses by place."""
+    """Return the first frame's camera, and camera-to-world poses by place."""
     trajectory = json_object(reader, name) or {}
     parameters = trajectory.get("parameters")
     if not isinstance(parameters, list) or len(parameters) > MAX_FRAMES:
@@ -144,7 +144,7 @@ def _json_trajectory(reader: ScanReader, name: str) -> tuple[Intrinsics | None, 
 
 
 def _json_camera(reader: ScanReader, value: Any, where: str) -> Intrinsics | None:
-    """Open3D's PinholeCameraIntrinsic; None if this is none."""
+    """Read Open3D's PinholeCameraIntrinsic; None if this is none."""
     matrix = json_numbers(value.get("intrinsic_matrix"), 9) if isinstance(value, dict) else None
     size = json_size(value.get("width"), value.get("height")) if isinstance(value, dict) else None
     if matrix is None or size is None:

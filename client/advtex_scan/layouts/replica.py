@@ -37,7 +37,7 @@ DEPTH_SCALE = 6553.5
 
 
 def detect(archive: ScanArchive) -> Match | None:
-    """`traj.txt` beside `results/frame*`."""
+    """Look for `traj.txt` beside `results/frame*`."""
     folder = folder_of(archive, POSE_FILE)
     if folder is None or not _images(archive, folder, FRAME):
         return None
@@ -45,7 +45,7 @@ def detect(archive: ScanArchive) -> Match | None:
 
 
 def read(reader: ScanReader) -> ScanManifest | None:
-    """All images with a pose."""
+    """Read all images with a pose."""
     folder = folder_of(reader.archive, POSE_FILE)
     if folder is None:
         return None
@@ -85,7 +85,7 @@ def _poses(reader: ScanReader, name: str) -> dict[int, Matrix4 | None]:
 
 
 def _camera(reader: ScanReader, folder: str) -> tuple[Intrinsics | None, float]:
-    """The camera, and how many depth units a metre has."""
+    """Return the camera, and how many depth units a metre has."""
     above = folder.rpartition("/")[0].rpartition("/")[0]
     candidates = (folder + CAMERA_FILE, f"{above}/{CAMERA_FILE}" if above else CAMERA_FILE)
     name = next((name for name in candidates if name in reader.archive), None)

@@ -30,13 +30,13 @@ Frames = dict[int, dict[str, str]]  # number -> kind of file -> path
 
 
 def detect(archive: ScanArchive) -> Match | None:
-    """`frame_NNNNN.jpg` with a `.json` of the same number."""
+    """Look for `frame_NNNNN.jpg` with a `.json` of the same number."""
     found = sum(1 for files in _frames(archive).values() if {"camera", "color"} <= files.keys())
     return Match(0.9, f"{found} images frame_NNNNN.jpg have a .json of their number") if found else None
 
 
 def read(reader: ScanReader) -> ScanManifest | None:
-    """All frames with an image."""
+    """Read all frames with an image."""
     frames = _frames(reader.archive)
     reader.used.update(name for files in frames.values() for name in files.values())
     reader.frames_found = len(frames)

@@ -25,7 +25,7 @@ EXTRINSIC_FILES = ("intrinsic/extrinsic_color.txt", "intrinsic/extrinsic_depth.t
 
 
 def detect(archive: ScanArchive) -> Match | None:
-    """`color/N.jpg` with `pose/N.txt`; surer with the intrinsic folder."""
+    """Look for `color/N.jpg` with `pose/N.txt`; the intrinsic folder makes it surer."""
     kinds = {match[1] for name in archive.names() if (match := FRAME.fullmatch(name))}
     if not {"color", "pose"} <= kinds:
         return None
@@ -35,7 +35,7 @@ def detect(archive: ScanArchive) -> Match | None:
 
 
 def read(reader: ScanReader) -> ScanManifest | None:
-    """All frames with color and a finite pose."""
+    """Read all frames with color and a finite pose."""
     frames = _frames(reader.archive)
     reader.frames_found = len(frames)
     info = read_scene_info(reader)

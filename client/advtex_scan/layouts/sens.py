@@ -47,13 +47,13 @@ class _Header:
 
 
 def detect(archive: ScanArchive) -> Match | None:
-    """A file that ends in `.sens`."""
+    """Look for a file that ends in `.sens`."""
     streams = _streams(archive)
     return Match(0.7, f"{streams[0]} is there") if streams else None
 
 
 def read(reader: ScanReader) -> ScanManifest | None:
-    """All frames with a finite pose."""
+    """Read all frames with a finite pose."""
     streams = _streams(reader.archive)
     if len(streams) > 1:
         message = f"there are {len(streams)} .sens files"
@@ -154,7 +154,7 @@ def _frames(reader: ScanReader, path: str, header: _Header, depth_to_color: Matr
 
 
 def _sizes_are_sound(reader: ScanReader, header: _Header, color_bytes: int, depth_bytes: int, where: str) -> bool:
-    """Whether blobs have the length that their codec implies; compressed ones must not be longer than raw ones."""
+    """Tell whether blobs have the length that their codec implies; compressed ones must not be longer than raw ones."""
     pixels = header.color.width * header.color.height
     depth_pixels = header.depth.width * header.depth.height if header.depth else 0
     color_ok = color_bytes == 3 * pixels if header.color_codec == "raw_rgb8" else 0 < color_bytes <= 4 * pixels + 65536

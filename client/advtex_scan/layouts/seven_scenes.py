@@ -35,13 +35,13 @@ class _Frame:
 
 
 def detect(archive: ScanArchive) -> Match | None:
-    """Any `frame-NNNNNN.color.*`."""
+    """Look for any `frame-NNNNNN.color.*`."""
     found = sum(1 for frame in _frames(archive).values() if "color" in frame.files)
     return Match(0.9, f"{found} files are named frame-NNNNNN.color.*") if found else None
 
 
 def read(reader: ScanReader) -> ScanManifest | None:
-    """All frames with color and pose."""
+    """Read all frames with color and pose."""
     frames = _frames(reader.archive)
     reader.frames_found = len(frames)
     colors = [frame.files["color"] for frame in frames.values() if "color" in frame.files]
@@ -114,7 +114,7 @@ def _info(reader: ScanReader) -> dict[str, str]:
 def _camera(
     reader: ScanReader, info: dict[str, str], kind: str, files: tuple[str, ...], size: tuple[int, int] | None
 ) -> Intrinsics | None:
-    """Intrinsics of the "Color" or "Depth" camera for images of `size`."""
+    """Return intrinsics of the "Color" or "Depth" camera for images of `size`."""
     if size is None:
         return None
     for name in files:

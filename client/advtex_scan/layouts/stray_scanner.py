@@ -39,14 +39,14 @@ class _Images:
 
 
 def detect(archive: ScanArchive) -> Match | None:
-    """`rgb.mp4` with `odometry.csv`."""
+    """Look for `rgb.mp4` with `odometry.csv`."""
     if VIDEO_FILE not in archive or POSE_FILE not in archive:
         return None
     return Match(0.95, f"{VIDEO_FILE} and {POSE_FILE} are there")
 
 
 def read(reader: ScanReader) -> ScanManifest | None:
-    """All pictures of the video with a pose."""
+    """Read all pictures of the video with a pose."""
     video = reader.video(VIDEO_FILE)
     rows = _rows(reader)
     if video is None:
@@ -73,7 +73,7 @@ def read(reader: ScanReader) -> ScanManifest | None:
 
 
 def _rows(reader: ScanReader) -> dict[int, dict[str, str]]:
-    """What the list says of each frame, by its number."""
+    """Return what the list says of each frame, by its number."""
     lines = [[word.strip() for word in line.split(",")] for line in list_lines(reader, POSE_FILE)]
     head = lines[0] if lines else []
     if not {"frame", *POSE_KEYS} <= set(head):

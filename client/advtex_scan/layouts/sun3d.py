@@ -27,13 +27,13 @@ POSE_NUMBERS = 12
 
 
 def detect(archive: ScanArchive) -> Match | None:
-    """`image/`, `extrinsics/` with text files, and `intrinsics.txt`."""
+    """Look for `image/`, `extrinsics/` with text files, and `intrinsics.txt`."""
     sound = CAMERA_FILE in archive and _pose_file(archive) and images_in(archive, COLOR_FOLDER)
     return Match(0.85, f"there are {COLOR_FOLDER}, {POSE_FOLDER} and {CAMERA_FILE}") if sound else None
 
 
 def read(reader: ScanReader) -> ScanManifest | None:
-    """All images with a pose."""
+    """Read all images with a pose."""
     pose_file = _pose_file(reader.archive)
     if pose_file is None:
         return None
@@ -68,7 +68,7 @@ def read(reader: ScanReader) -> ScanManifest | None:
 
 
 def _pose_file(archive: ScanArchive) -> str | None:
-    """The newest one: their names are times."""
+    """Return the newest one: their names are times."""
     files = [name for name in archive.names() if name.startswith(POSE_FOLDER) and name.endswith(".txt")]
     return files[-1] if files else None
 

@@ -50,13 +50,13 @@ RECORDING = re.compile(r"#.*(freiburg[123])")
 
 
 def detect(archive: ScanArchive) -> Match | None:
-    """`rgb.txt` and `groundtruth.txt`."""
+    """Look for `rgb.txt` and `groundtruth.txt`."""
     folder = folder_of(archive, COLOR_LIST, POSE_LIST)
     return None if folder is None else Match(0.9, f"{folder}{COLOR_LIST} and {POSE_LIST} are there")
 
 
 def read(reader: ScanReader) -> ScanManifest | None:
-    """All images of `rgb.txt` that are there and have a pose."""
+    """Read all images of `rgb.txt` that are there and have a pose."""
     folder = folder_of(reader.archive, COLOR_LIST, POSE_LIST)
     if folder is None:
         return None
@@ -87,7 +87,7 @@ def read(reader: ScanReader) -> ScanManifest | None:
 
 
 def _images(reader: ScanReader, folder: str, name: str) -> list[tuple[float, str]]:
-    """Time and path of each line, by time."""
+    """Return time and path of each line, by time."""
     entries = []
     for line in list_lines(reader, folder + name):
         words = line.split(maxsplit=1)
@@ -123,7 +123,7 @@ def _track(reader: ScanReader, name: str) -> Track:
 
 
 def _pose(reader: ScanReader, track: Track, time: float, path: str) -> Matrix4 | None:
-    """The pose of an image; None, counted as dropped, if there is no image or no pose."""
+    """Return the pose of an image; None, counted as dropped, if there is no image or no pose."""
     if path not in reader.archive:
         remedy = f"add the image, or take its line out of {COLOR_LIST}"
         reader.drop("missing_color", path, "is listed but not there; the frame is left out", remedy)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from advtex_scan.archive import ScanArchive
 from advtex_scan.errors import MeshError
 from advtex_scan.mesh._arithmetic import Arithmetic, PlainArithmetic, Vector
-from advtex_scan.mesh._gltf import read_gltf
+from advtex_scan.mesh._gltf import open_gltf, read_gltf
 from advtex_scan.mesh._obj import read_obj
 from advtex_scan.mesh._part import MAX_BYTES, MAX_ELEMENTS, MeshPart, MeshSource, broken, check_size
 from advtex_scan.mesh._ply import read_ply
@@ -19,6 +19,7 @@ from advtex_scan.mesh._text import BLOCK
 __all__ = [
     "MAX_BYTES",
     "MAX_ELEMENTS",
+    "PLAIN",
     "Arithmetic",
     "MeshFacts",
     "MeshPart",
@@ -26,6 +27,7 @@ __all__ = [
     "MeshSurface",
     "PlainArithmetic",
     "Vector",
+    "open_gltf",
     "parse_mesh",
     "read_mesh",
 ]

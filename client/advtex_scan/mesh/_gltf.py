@@ -33,7 +33,7 @@ def read_gltf(source: MeshSource, arithmetic: Arithmetic) -> tuple[list[MeshPart
     """The parts of a `.glb` or `.gltf`, and the other files that it refers to. Raises MeshError."""
     path = source.path
     try:
-        document, binary = _open(source)
+        document, binary = open_gltf(source)
         _refuse_compression(document, path)
         buffers = Buffers(document, binary, source)
         return list(_parts(document, buffers, arithmetic, path)), tuple(buffers.files)
@@ -44,8 +44,8 @@ def read_gltf(source: MeshSource, arithmetic: Arithmetic) -> tuple[list[MeshPart
         raise MeshError(broken(path, "is nested too deeply")) from error
 
 
-def _open(source: MeshSource) -> tuple[Json, bytes | None]:
-    """The document and the binary part of a GLB."""
+def open_gltf(source: MeshSource) -> tuple[Json, bytes | None]:
+    """The document, and the binary part of a GLB that has one. Raises MeshError, and ValueError for what is no JSON."""
     head = source.stream.read(HEADER.size + CHUNK.size)
     if head[:4] != b"glTF" and not source.path.lower().endswith(".glb"):
         if source.size > MAX_JSON:
@@ -159,8 +159,8 @@ def _part(buffers: Buffers, primitive: Json, transform: Any) -> MeshPart:
     uv = buffers.vectors(attributes["TEXCOORD_0"], 2) if "TEXCOORD_0" in attributes else None
     if uv is not None and len(uv) // 2 != len(positions) // 3:
         uv = None
-    materials = [(0, str(primitive.get("material", "")))]
-    return MeshPart(positions, triangles, uv, v_up=False, transform=transform, materials=materials)
+    material = str(int(primitive["material"])) if "material" in primitive else ""
+    return MeshPart(positions, triangles, uv, v_up=False, transform=transform, materials=[(0, material)])
 
 
 def _triangles(indices: array[int], mode: int) -> array[int]:

@@ -92,21 +92,20 @@ class _Contents:
         faces = _faces(kinds[b"f "]) if b"f " in kinds else _Faces(3, [], None)
         if positions is None or uv is None or faces is None:
             return False
-        if b"-" in kinds.get(b"f ", b"") and (positions or uv):
-            return False  # it counts from the newest vertex of its own line
+        vertices, coordinates = len(self._mesh.positions) // 3, len(self._uv) // 2
         self._mesh.positions.extend(positions)
         self._uv.extend(uv)
-        self._add_faces(faces)
+        if faces.corners:
+            relative = b"-" in kinds[b"f "] and len(kinds) > 1
+            above = _counts_above(text, b"v ", faces) if relative else None
+            corners = _from_zero(faces.corners, vertices, above)
+            add_fans(self._mesh.triangles, corners, faces.sides)
+            if faces.uv is None or self._uv_triangles is None:
+                self._uv_triangles = None
+            else:
+                above = _counts_above(text, b"vt", faces) if relative else None
+                add_fans(self._uv_triangles, _from_zero(faces.uv, coordinates, above), faces.sides)
         return True
-
-    def _add_faces(self, faces: _Faces) -> None:
-        if not faces.corners:
-            return
-        _add_polygons(self._mesh.triangles, faces.sides, _from_zero(faces.corners, len(self._mesh.positions) // 3))
-        if faces.uv is None or self._uv_triangles is None:
-            self._uv_triangles = None
-        else:
-            _add_polygons(self._uv_triangles, faces.sides, _from_zero(faces.uv, len(self._uv) // 2))
 
     # Word by word -----------------------------------------------------------------------------------------------------
 
@@ -116,19 +115,29 @@ class _Contents:
         for line in text.replace(b"\\\n", b"\v").splitlines():
             number += 1 + line.count(b"\v")
             words = line.split()
+            kind = words[0] if words else b""
             try:
-                match words[:1]:
-                    case [b"v"]:
-                        self._mesh.positions.extend((float(words[1]), float(words[2]), float(words[3])))
-                    case [b"vt"]:
-                        self._uv.extend((float(words[1]), float(words[2]) if len(words) > 2 else 0.0))
-                    case [b"f"]:
-                        self._add_faces(_face(words[1:]))
-                    case [b"usemtl"]:
-                        self._use_material(words[1:])
+                if kind == b"v":
+                    self._mesh.positions.extend((float(words[1]), float(words[2]), float(words[3])))
+                elif kind == b"vt":
+                    self._uv.extend((float(words[1]), float(words[2]) if len(words) > 2 else 0.0))
+                elif kind == b"f":
+                    self._add_face(words[1:])
+                elif kind == b"usemtl":
+                    self._use_material(words[1:])
             except (ValueError, IndexError, OverflowError) as error:
                 shown = line[:60].decode("ascii", "replace").strip()
                 raise MeshError(broken(self._path, f"line {number} is not understood: {shown!r}")) from error
+
+    def _add_face(self, words: list[bytes]) -> None:
+        parts = [word.split(b"/") for word in words]
+        uv = [int(part[1]) for part in parts if len(part) > 1 and part[1]]
+        if len(uv) < len(parts):
+            self._uv_triangles = None
+        elif self._uv_triangles is not None:
+            add_fans(self._uv_triangles, _from_zero(uv, len(self._uv) // 2), [len(parts)])
+        corners = _from_zero([int(part[0]) for part in parts], len(self._mesh.positions) // 3)
+        add_fans(self._mesh.triangles, corners, [len(parts)])
 
 
 def _by_kind(text: bytes) -> dict[bytes, bytes] | None:
@@ -190,25 +199,26 @@ def _faces(text: bytes) -> _Faces | None:
     return _Faces(sides, found[::step], found[1::step] if form and not doubled else None)
 
 
-def _face(words: list[bytes]) -> _Faces:
-    """A face's corners. Raises ValueError."""
-    parts = [word.split(b"/") for word in words]
-    uv = [int(part[1]) for part in parts if len(part) > 1 and part[1]]
-    return _Faces(len(parts), [int(part[0]) for part in parts], uv if len(uv) == len(parts) else None)
+def _counts_above(text: bytes, kind: bytes, faces: _Faces) -> list[int]:
+    """How many lines of a kind stand above the line of each corner."""
+    count, above = 0, list[int]()
+    for line in text.splitlines():
+        if line.startswith(kind):
+            count += 1
+        elif line.startswith(b"f "):
+            above.append(count)
+    sides = repeat(faces.sides) if isinstance(faces.sides, int) else faces.sides
+    return [each for each, corners in zip(above, sides, strict=False) for _ in range(corners)]
 
 
-def _from_zero(indices: list[int], count: int) -> array[int]:
-    """Indices that count from 0; the file's count from 1, or with a sign from the newest of `count`. 0 becomes -1."""
-    if min(indices) < 0:
-        return array("q", [index - 1 if index >= 0 else max(index + count, -1) for index in indices])
-    return array("q", map(sub, indices, repeat(1)))
+def _from_zero(indices: list[int], count: int, above: list[int] | None = None) -> array[int]:
+    """Indices that count from 0.
 
-
-def _add_polygons(triangles: array[int], sides: int | list[int], corners: array[int]) -> None:
-    if isinstance(sides, int):
-        return add_fans(triangles, corners, sides)
-    at = 0
-    for count in sides:
-        add_fans(triangles, corners[at : at + count], count)
-        at += count
-    return None
+    The file's count from 1; those with a sign, back from the newest of what was there before, which are `count` and as
+    many as `above` says of each. 0 becomes -1.
+    """
+    if min(indices, default=0) >= 0:
+        return array("q", map(sub, indices, repeat(1)))
+    newest = repeat(count, len(indices)) if above is None else map(count.__add__, above)
+    pairs = zip(indices, newest, strict=True)
+    return array("q", [index - 1 if index >= 0 else max(index + end, -1) for index, end in pairs])

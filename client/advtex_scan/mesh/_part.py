@@ -71,18 +71,27 @@ def check_size(path: str, size: int) -> None:
         raise MeshError(broken(path, message, "decimate the mesh", "mesh_too_large"))
 
 
-def add_fans(triangles: array[int], corners: Sequence[int], sides: int) -> None:
-    """Append polygons of `sides` corners each, split into fans around their first corners; none if it is below 3."""
-    if sides == 3:
+def add_fans(triangles: array[int], corners: Sequence[int], sides: int | Sequence[int]) -> None:
+    """Append polygons, split into fans around their first corners; those of fewer than three corners are left out.
+
+    corners: of all polygons, one after the other; sides: how many each of them has, one number if all have as many
+    """
+    if not isinstance(sides, int):
+        named, fans, first = list(corners), list[int](), 0
+        for count in sides:
+            if count == 3:
+                fans += named[first : first + 3]
+            for k in range(first + 1, first + count - 1 if count > 3 else 0):
+                fans += (named[first], named[k], named[k + 1])
+            first += count
+        triangles.extend(fans)
+    elif sides == 3:
         triangles.extend(corners)
-    elif sides == len(corners):
-        for k in range(1, sides - 1):
-            triangles.extend((corners[0], corners[k], corners[k + 1]))
     elif sides > 3:
         every, step = array("q", corners), 3 * (sides - 2)
-        fans = array("q", bytes(8 * step * (len(every) // sides)))
+        fan = array("q", bytes(8 * step * (len(every) // sides)))
         for k in range(sides - 2):
-            fans[3 * k :: step] = every[0::sides]
-            fans[3 * k + 1 :: step] = every[k + 1 :: sides]
-            fans[3 * k + 2 :: step] = every[k + 2 :: sides]
-        triangles.extend(fans)
+            fan[3 * k :: step] = every[0::sides]
+            fan[3 * k + 1 :: step] = every[k + 1 :: sides]
+            fan[3 * k + 2 :: step] = every[k + 2 :: sides]
+        triangles.extend(fan)

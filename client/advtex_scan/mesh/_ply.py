@@ -30,9 +30,9 @@ UV_NAMES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 
 def read_ply(source: MeshSource) -> MeshPart:
     """Vertices, fan-split faces and uv (of vertices, or `texcoord` of corners) of a PLY file. Raises MeshError."""
-    order, elements = _header(source)
+    order, elements, size = _header(source)
     _check_elements(source, order, elements)
-    rows = BinaryRows(source.stream, source.size, order) if order else TextRows(source.stream)
+    rows = BinaryRows(source.stream, size, order) if order else TextRows(source.stream)
     contents = _Contents(source.path)
     needed = {"vertex", *(element.name for element in elements if element.name == "face")}
     for element in elements:
@@ -52,10 +52,12 @@ def read_ply(source: MeshSource) -> MeshPart:
     return contents.part()
 
 
-def _header(source: MeshSource) -> tuple[str, list[Element]]:
-    """The order of bytes ("<", ">", "" for ascii) and the elements."""
-    path, left = source.path, MAX_HEADER
-    if source.stream.readline(left).strip() != b"ply":
+def _header(source: MeshSource) -> tuple[str, list[Element], int]:
+    """The order of bytes ("<", ">", "" for ascii), the elements, and how many bytes follow."""
+    path = source.path
+    line = source.stream.readline(MAX_HEADER)
+    left = MAX_HEADER - len(line)
+    if line.strip() != b"ply":
         raise MeshError(broken(path, "is no PLY file"))
     order: str | None = None
     elements: list[Element] = []
@@ -83,7 +85,7 @@ def _header(source: MeshSource) -> tuple[str, list[Element]]:
         raise MeshError(broken(path, f"its header is cut off, or longer than {MAX_HEADER} bytes"))
     if order is None:
         raise MeshError(broken(path, "its header states no format"))
-    return order, elements
+    return order, elements, source.size - (MAX_HEADER - left)
 
 
 def _count(word: str) -> int:
@@ -154,12 +156,14 @@ class _Contents:
 
     def add_faces(self, run: Run, indices: str) -> None:
         sides, corners = run.lengths[indices], run.values[indices]
-        check_counts(self._path, 0, len(self._mesh.triangles) // 3 + run.rows * max(sides - 2, 0))
+        fans = run.rows * max(sides - 2, 0) if isinstance(sides, int) else sum(max(each - 2, 0) for each in sides)
+        check_counts(self._path, 0, len(self._mesh.triangles) // 3 + fans)
         add_fans(self._mesh.triangles, corners, sides)
-        if self._corner_uv is not None and run.lengths.get(TEXCOORD) == 2 * sides and TEXCOORD in run.values:
+        doubled = 2 * sides if isinstance(sides, int) else [2 * each for each in sides]
+        if self._corner_uv is not None and run.lengths.get(TEXCOORD) == doubled and TEXCOORD in run.values:
             first = len(self._corner_uv) // 2
-            self._corner_uv.extend(run.values[TEXCOORD])
-            add_fans(self._corner_triangles, array("q", range(first, first + run.rows * sides)), sides)
+            self._corner_uv.extend(array("d", run.values[TEXCOORD]))
+            add_fans(self._corner_triangles, range(first, first + len(corners)), sides)
         else:
             self._corner_uv = None
 

@@ -46,19 +46,19 @@ class Element:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """Rows one after the other whose lists have the same lengths.
+    """Rows one after the other.
 
-    lengths: how many values of a property each row has, 1 unless it is a list
+    lengths: how many values of a property each row has, 1 unless it is a list; one number if all have as many
     values: of the properties that were asked for, row by row; integers of a list are "q" in an array
     """
 
     rows: int
-    lengths: dict[str, int]
+    lengths: Mapping[str, int | Sequence[int]]
     values: Mapping[str, Sequence[Any]]
 
 
 class BinaryRows:
-    """Rows of a binary file. size: bytes that the stream may still hold, which no list is believed to exceed."""
+    """Rows of a binary file. size: bytes that are left in the stream; no list is believed to exceed them."""
 
     def __init__(self, stream: BinaryIO, size: int, order: str) -> None:
         self._stream, self._left, self._order = stream, size, order
@@ -73,7 +73,7 @@ class BinaryRows:
             done += run.rows
             if run.rows < SHORT_RUN and done < element.count:
                 few = min(ONE_BY_ONE, element.count - done)
-                yield from self._one_by_one(element, few, wanted)
+                yield self._one_by_one(element, few, wanted)
                 done += few
 
     def _fill(self, size: int) -> None:
@@ -132,29 +132,31 @@ class BinaryRows:
         }
         return Run(rows, _by_name(element, lengths), found)
 
-    def _one_by_one(self, element: Element, rows: int, wanted: Collection[str]) -> Iterator[Run]:
-        layouts = dict[tuple[int, ...], tuple[struct.Struct, dict[str, int], dict[str, slice]]]()
+    def _one_by_one(self, element: Element, rows: int, wanted: Collection[str]) -> Run:
+        layouts = dict[tuple[int, ...], tuple[struct.Struct, dict[str, slice]]]()
+        many = _Rows(element, wanted)
         for _ in range(rows):
             lengths = self._lengths(element)
             if lengths not in layouts:
-                layouts[lengths] = self._layout(element, lengths, wanted)
-            layout, named, slices = layouts[lengths]
+                layouts[lengths] = self._layout(element, lengths)
+            layout, places = layouts[lengths]
             row = layout.unpack_from(self._data, self._at)
             self._at += layout.size
-            yield Run(1, named, {name: row[place] for name, place in slices.items()})
+            for name, (sizes, values) in many.columns.items():
+                found = row[places[name]]
+                sizes.append(len(found))
+                values += found
+        return many.run()
 
-    def _layout(
-        self, element: Element, lengths: tuple[int, ...], wanted: Collection[str]
-    ) -> tuple[struct.Struct, dict[str, int], dict[str, slice]]:
-        """A row as a whole, and the places of its values among all that it holds."""
-        code, place, slices = self._order, 0, dict[str, slice]()
+    def _layout(self, element: Element, lengths: tuple[int, ...]) -> tuple[struct.Struct, dict[str, slice]]:
+        """A row as a whole, and the places of a property's values among all that it holds."""
+        code, place, places = self._order, 0, dict[str, slice]()
         for one, length in zip(element.properties, lengths, strict=True):
             code += f"{one.count}{length}{one.kind}"
             place += bool(one.count)
-            if one.name in wanted:
-                slices[one.name] = slice(place, place + length)
+            places[one.name] = slice(place, place + length)
             place += length
-        return struct.Struct(code), _by_name(element, lengths), slices
+        return struct.Struct(code), places
 
 
 class TextRows:
@@ -174,7 +176,7 @@ class TextRows:
             found = table(tidy(text), int if whole else float)
             run = None if found is None else _alike(element, *found, wanted)
             if run is None:
-                yield from (_row(element, line.split(), wanted) for line in text.splitlines())
+                yield _word_by_word(element, text, wanted)
             else:
                 yield run
 
@@ -204,24 +206,39 @@ def _alike(element: Element, numbers: list[Any], columns: int, wanted: Collectio
     return Run(rows, _by_name(element, lengths), values)
 
 
-def _row(element: Element, words: list[bytes], wanted: Collection[str]) -> Run:
-    """One row in words of its line."""
-    at = 0
-    lengths, values = list[int](), dict[str, Sequence[Any]]()
-    for one in element.properties:
-        length = 1
-        if one.count:
-            length, at = int(float(words[at])) if at < len(words) else 1, at + 1
-        if length < 0:
-            raise ValueError(f"a list of {length} values")
-        if at + length > len(words):
-            raise EOFError("a line is too short")
-        numbers = map(float, words[at : at + length])
-        if one.name in wanted:
-            values[one.name] = tuple(map(int, numbers)) if one.whole else tuple(numbers)
-        lengths.append(length)
-        at += length
-    return Run(1, _by_name(element, lengths), values)
+def _word_by_word(element: Element, text: bytes, wanted: Collection[str]) -> Run:
+    """The rows of any lines. Raises EOFError, ValueError."""
+    many = _Rows(element, wanted)
+    whole = {one.name for one in element.properties if one.whole}
+    for line in text.splitlines():
+        words, at = line.split(), 0
+        for one in element.properties:
+            length = 1
+            if one.count and at < len(words):
+                length, at = int(float(words[at])), at + 1
+            if length < 0:
+                raise ValueError(f"a list of {length} values")
+            if at + length > len(words):
+                raise EOFError("a line is too short")
+            if one.name in many.columns:
+                sizes, values = many.columns[one.name]
+                sizes.append(length)
+                numbers = map(float, words[at : at + length])
+                values.extend(map(int, numbers) if one.name in whole else numbers)
+            at += length
+    return many.run()
+
+
+class _Rows:
+    """Rows that are read one by one. columns: by the properties that are wanted, each row's length, and all values."""
+
+    def __init__(self, element: Element, wanted: Collection[str]) -> None:
+        self.columns = {one.name: (list[int](), list[Any]()) for one in element.properties if one.name in wanted}
+
+    def run(self) -> Run:
+        rows = max((len(sizes) for sizes, _ in self.columns.values()), default=0)
+        lengths = {name: sizes for name, (sizes, _) in self.columns.items()}
+        return Run(rows, lengths, {name: values for name, (_, values) in self.columns.items()})
 
 
 def _by_name(element: Element, lengths: Sequence[int]) -> dict[str, int]:

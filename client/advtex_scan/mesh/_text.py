@@ -11,7 +11,7 @@ import json
 from collections.abc import Callable
 from typing import Any, BinaryIO
 
-BLOCK = 1 << 20  # bytes that are read at a time; no line may be longer
+BLOCK = 1 << 18  # bytes that are read at a time; no line may be longer
 INTEGERS = b"0123456789-"
 NUMERALS = b"0123456789+-.eE"
 _COMMAS = bytes.maketrans(b" \n/", b",,,")

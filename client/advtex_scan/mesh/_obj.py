@@ -92,19 +92,21 @@ class _Contents:
         faces = _faces(kinds[b"f "]) if b"f " in kinds else _Faces(3, [], None)
         if positions is None or uv is None or faces is None:
             return False
-        vertices, coordinates = len(self._mesh.positions) // 3, len(self._uv) // 2
+        relative = b"-" in kinds.get(b"f ", b"") and len(kinds) > 1
+        try:
+            above = _counts_above(text, b"v ", faces) if relative else None
+            corners = _from_zero(faces.corners, len(self._mesh.positions) // 3, above)
+            above = _counts_above(text, b"vt", faces) if relative else None
+            uv_corners = _from_zero(faces.uv or [], len(self._uv) // 2, above if faces.uv else None)
+        except OverflowError:
+            return False
         self._mesh.positions.extend(positions)
         self._uv.extend(uv)
-        if faces.corners:
-            relative = b"-" in kinds[b"f "] and len(kinds) > 1
-            above = _counts_above(text, b"v ", faces) if relative else None
-            corners = _from_zero(faces.corners, vertices, above)
-            add_fans(self._mesh.triangles, corners, faces.sides)
-            if faces.uv is None or self._uv_triangles is None:
-                self._uv_triangles = None
-            else:
-                above = _counts_above(text, b"vt", faces) if relative else None
-                add_fans(self._uv_triangles, _from_zero(faces.uv, coordinates, above), faces.sides)
+        add_fans(self._mesh.triangles, corners, faces.sides)
+        if len(uv_corners) < len(corners):
+            self._uv_triangles = None
+        elif self._uv_triangles is not None:
+            add_fans(self._uv_triangles, uv_corners, faces.sides)
         return True
 
     # Word by word -----------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""The elements of a PLY file, in runs of rows whose lists have the same lengths."""
+"""The elements of a PLY file, in runs of rows: rows whose lists have the same lengths are read at once."""
 
 from __future__ import annotations
 
@@ -65,6 +65,7 @@ class BinaryRows:
         self._data, self._at = b"", 0
 
     def runs(self, element: Element, wanted: Collection[str]) -> Iterator[Run]:
+        """All rows of the element that comes next, with the properties that are wanted. Raises EOFError, ValueError."""
         done = 0
         while done < element.count:
             lengths = self._lengths(element)
@@ -166,6 +167,7 @@ class TextRows:
         self._reader = TextReader(stream)
 
     def runs(self, element: Element, wanted: Collection[str]) -> Iterator[Run]:
+        """As those of `BinaryRows`."""
         whole = all(one.whole for one in element.properties if one.name in wanted)
         done = 0
         while done < element.count:

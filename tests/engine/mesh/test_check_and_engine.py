@@ -194,3 +194,11 @@ def test_an_error_far_down_names_its_line() -> None:
             parse(MeshFile("m.obj", text, np.empty(0), []), PLAIN)
         number = line + (4 if text.startswith(b"f 1 2") else 0)
         assert caught.value.findings[0].message.startswith(f"line {number} is not understood: 'f x")
+
+
+@pytest.mark.parametrize("index", ["99999999999999999999", "-99999999999999999999", "1" * 5000])
+def test_an_index_beyond_64_bits_is_not_understood(index: str) -> None:
+    data = f"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 2 {index}\n".encode()
+    for arithmetic in (PLAIN, NUMPY):
+        with pytest.raises(MeshError, match=r"line 5 is not understood|a face names vertex -1"):
+            parse(MeshFile("m.obj", data, np.empty(0), []), arithmetic)

@@ -10,8 +10,7 @@ from itertools import accumulate
 from advtex_scan.errors import Findings
 from advtex_scan.manifest import IDENTITY, FrameEntry, ScanManifest
 from advtex_scan.matrices import compose, invert_rigid
-from advtex_scan.mesh import MeshSurface
-from advtex_scan.mesh._surface import Vector
+from advtex_scan.mesh import MeshSurface, Vector
 
 SAMPLED_TRIANGLES = 20_000
 SAMPLED_POINTS = 2_000

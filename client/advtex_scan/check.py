@@ -21,7 +21,7 @@ from advtex_scan.layouts import LAYOUT_NAMES, Layout, Match, ScanReader, matchin
 from advtex_scan.layouts._mesh_choice import MESH_SUFFIXES
 from advtex_scan.layouts._reader import IMAGE_SUFFIXES
 from advtex_scan.manifest import ScanManifest
-from advtex_scan.mesh import MeshFacts, read_mesh
+from advtex_scan.mesh import PLAIN, Arithmetic, MeshFacts, MeshSurface, read_mesh
 
 MIN_FRAMES = 3
 KINDS = {
@@ -92,11 +92,13 @@ class ScanReading:
     """A scan's manifest with its report. The manifest may be textured only if `report.ok`.
 
     The manifest holds usable frames only, with color intrinsics at the stored images' size; it is None if no layout
-    could make anything of the files.
+    could make anything of the files. The mesh is the one that the manifest names, None if it names none or it is
+    broken.
     """
 
     manifest: ScanManifest | None
     report: CheckReport
+    mesh: MeshSurface | None = None
 
 
 def check_scan(scan: str | os.PathLike[str] | ScanArchive, layout: str | None = None) -> CheckReport:
@@ -116,10 +118,11 @@ def check_scan(scan: str | os.PathLike[str] | ScanArchive, layout: str | None = 
         return CheckReport(findings=(Finding("error", "unreadable_file", Path(scan).name, message, "check it"),))
 
 
-def read_scan(archive: ScanArchive, layout: str | None = None) -> ScanReading:
-    """Read an archive's manifest and check all that can be checked without decoding images.
+def read_scan(archive: ScanArchive, layout: str | None = None, arithmetic: Arithmetic = PLAIN) -> ScanReading:
+    """Read an archive's manifest and mesh, and check all that can be checked without decoding images.
 
-    layout: as for `check_scan`. Nothing that is wrong with the scan raises; it is in the report.
+    layout: as for `check_scan`; arithmetic: as for `read_mesh`. Nothing that is wrong with the scan raises; it is in
+    the report.
     """
     matches = matching_layouts(archive)
     chosen = next((pair for pair in matches if layout in (None, pair[0].NAME)), None)
@@ -127,10 +130,10 @@ def read_scan(archive: ScanArchive, layout: str | None = None) -> ScanReading:
         return ScanReading(None, CheckReport(findings=(_no_layout(archive, layout, matches),)))
     reader = ScanReader(archive)
     manifest = chosen[0].read(reader)
-    facts = None
+    mesh = None
     if manifest is not None:
         manifest = _usable(reader, manifest)
-        facts = _check_mesh(reader, manifest)
+        mesh = _check_mesh(reader, manifest, arithmetic)
         _report_ignored(reader)
     for other, match in matches:
         if other is not chosen[0]:
@@ -143,11 +146,11 @@ def read_scan(archive: ScanArchive, layout: str | None = None) -> ScanReading:
         frames_found=reader.frames_found,
         frames_usable=len(manifest.frames) if manifest else 0,
         dropped=dict(reader.dropped),
-        mesh=facts,
+        mesh=mesh.facts if mesh else None,
         view_size=_largest(manifest),
         findings=reader.findings.result(),
     )
-    return ScanReading(manifest, report)
+    return ScanReading(manifest, report, mesh)
 
 
 def _no_layout(archive: ScanArchive, layout: str | None, matches: list[tuple[Layout, Match]]) -> Finding:
@@ -205,19 +208,19 @@ def _left_out(dropped: Mapping[str, int]) -> str:
     return f" (left out: {reasons})" if reasons else ""
 
 
-def _check_mesh(reader: ScanReader, manifest: ScanManifest) -> MeshFacts | None:
+def _check_mesh(reader: ScanReader, manifest: ScanManifest, arithmetic: Arithmetic) -> MeshSurface | None:
     if manifest.mesh is None:
         _report_no_mesh(reader, manifest)
         return None
     reader.used.add(manifest.mesh.path)
     try:
-        mesh = read_mesh(reader.archive, manifest.mesh.path)
+        mesh = read_mesh(reader.archive, manifest.mesh.path, arithmetic)
     except ScanFormatError as error:
         reader.findings.extend(error.findings)
         return None
     reader.used.update(mesh.files)
     check_sight(reader.findings, manifest, mesh)
-    return mesh.facts
+    return mesh
 
 
 def _report_no_mesh(reader: ScanReader, manifest: ScanManifest) -> None:

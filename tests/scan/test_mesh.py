@@ -106,8 +106,9 @@ o second
 f -4//1 -3//1 -1//1
 """
     mesh = read(tmp_path, "mesh.obj", text)
-    assert mesh.facts.has_uv
     np.testing.assert_array_equal(arrays(mesh)[1], [(0, 1, 2), (0, 2, 3), (0, 1, 3)])
+    assert not mesh.facts.has_uv, "some corners have none"
+    assert read(tmp_path, "mesh.obj", text.replace(b"//1", b"/1")).facts.has_uv
     assert not read(tmp_path, "mesh.obj", text.replace(b"/1/1", b"//1")).facts.has_uv
 
 
@@ -124,8 +125,9 @@ def gltf(positions, indices, **changes) -> dict:
         "accessors": [
             {"bufferView": 0, "componentType": 5126, "count": len(positions), "type": "VEC3"},
             {"bufferView": 1, "componentType": 5123, "count": len(indices), "type": "SCALAR"},
+            {"bufferView": 0, "componentType": 5126, "count": len(positions), "type": "VEC2"},
         ],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 0}, "indices": 1}]}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 2}, "indices": 1}]}],
         "nodes": [{"mesh": 0}],
         "scenes": [{"nodes": [0]}],
         "scene": 0,
@@ -165,7 +167,7 @@ def test_gltf_applies_node_transforms_as_trimesh_does(tmp_path):
         ({"buffers": [{"byteLength": 4, "uri": "../../etc/passwd"}]}, "missing_file"),
         ({"buffers": [{"byteLength": 4, "uri": "data:,???"}]}, "bad_mesh"),
         ({"buffers": [{"byteLength": 4}]}, "mesh_truncated"),
-        ({"meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 1}]}]}, "bad_mesh"),
+        ({"meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 1}]}]}, "mesh_no_faces"),
         ({"meshes": [{"primitives": []}]}, "mesh_no_faces"),
         ({"meshes": [{"primitives": [{"attributes": {}}] * 100_001}]}, "bad_mesh"),
     ],

@@ -1,241 +1,181 @@
 """glTF 2.0, `.glb` or `.gltf` with embedded or neighboring buffers: the triangles of the default scene.
 
-Node transforms are applied, so that positions are in world coordinates as the file places them.
+Strips and fans become triangles, points and lines are passed over, quantized positions (KHR_mesh_quantization) are
+read. Each node that draws a mesh gives parts of its own, with the transform to the world as the file places it.
 """
 
 from __future__ import annotations
 
-import base64
-import binascii
 import json
+import math
 import struct
 from array import array
-from collections.abc import Sequence
-from dataclasses import dataclass
-from posixpath import dirname, join, normpath
-from typing import Any, cast
-from urllib.parse import unquote
+from collections.abc import Iterator
+from typing import Any
 
-from advtex_scan.archive import ScanArchive
 from advtex_scan.errors import MeshError
 from advtex_scan.manifest import IDENTITY, Matrix4
-from advtex_scan.matrices import compose, matrix4
-from advtex_scan.mesh._surface import RawMesh, broken, check_counts
+from advtex_scan.matrices import from_quaternion, matrix4
+from advtex_scan.mesh._arithmetic import Arithmetic
+from advtex_scan.mesh._gltf_buffers import Buffers, item
+from advtex_scan.mesh._part import DAMAGED, MeshPart, MeshSource, broken, check_counts
 
-MAX_JSON = 16 << 20
-MAX_BUFFER = 1 << 30
-MAX_NODES = 100_000  # also of primitives drawn, repeated ones counted
-HEADER = struct.Struct("<4s2I")
-CHUNK = struct.Struct("<2I")
+MAX_JSON = 16 << 20  # bytes; parsed, it takes some thirty times as much
+MAX_NODES = 100_000  # also of primitives drawn; both are counted each time that they are drawn
+HEADER, CHUNK = struct.Struct("<4s2I"), struct.Struct("<2I")
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
-FLOAT, INDEX_KINDS = 5126, {5121: "B", 5123: "H", 5125: "I"}
-TRIANGLES = 4
-COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_mesh_quantization")
+TRIANGLES, STRIP, FAN = 4, 5, 6
+COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 Json = dict[str, Any]
 
 
-@dataclass(slots=True)
-class _File:
-    archive: ScanArchive
-    path: str
-    document: Json
-    binary: tuple[int, int] | None  # offset and length of the GLB's binary chunk
-    buffers: dict[int, bytes]
-    files: list[str]
-
-
-def read_gltf(archive: ScanArchive, path: str) -> RawMesh:
-    """World positions and triangles of a `.glb` or `.gltf`. Raises MeshError."""
+def read_gltf(source: MeshSource, arithmetic: Arithmetic) -> tuple[list[MeshPart], tuple[str, ...]]:
+    """The parts of a `.glb` or `.gltf`, and the other files that it refers to. Raises MeshError."""
+    path = source.path
     try:
-        file = _open_glb(archive, path) if path.lower().endswith(".glb") else _open_json(archive, path)
-        _refuse_compression(file)
-        mesh = RawMesh()
-        drawn = 0
-        for node, transform in _nodes(file.document):
-            index = node.get("mesh")
-            if index is not None:
-                for primitive in _item(file.document, "meshes", index).get("primitives", []):
-                    drawn += 1
-                    if drawn > MAX_NODES:
-                        raise ValueError(f"more than {MAX_NODES} primitives")
-                    _add_primitive(file, primitive, transform, mesh)
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, struct.error) as error:
+        document, binary = open_gltf(source)
+        _refuse_compression(document, path)
+        buffers = Buffers(document, binary, source)
+        return list(_parts(document, buffers, arithmetic, path)), tuple(buffers.files)
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, struct.error) as error:
         # A file of this kind is a graph of indices; whatever does not resolve ends here.
         raise MeshError(broken(path, f"is damaged: its parts do not fit together ({error})"[:200])) from error
     except RecursionError as error:
         raise MeshError(broken(path, "is nested too deeply")) from error
-    mesh.files = tuple(file.files)
-    return mesh
 
 
-def _open_glb(archive: ScanArchive, path: str) -> _File:
-    size = archive.size(path)
-    if size < HEADER.size + CHUNK.size:
-        raise MeshError(broken(path, "is cut off", "copy the file again in full", "mesh_truncated"))
-    magic, version, length = HEADER.unpack(archive.read_range(path, 0, HEADER.size))
+def open_gltf(source: MeshSource) -> tuple[Json, bytes | None]:
+    """The document, and the binary part of a GLB that has one. Raises MeshError, and ValueError for what is no JSON."""
+    head = source.stream.read(HEADER.size + CHUNK.size)
+    if head[:4] != b"glTF" and not source.path.lower().endswith(".glb"):
+        if source.size > MAX_JSON:
+            message = f"holds more than {MAX_JSON} bytes of JSON"
+            raise MeshError(broken(source.path, message, "export it as GLB", "mesh_too_large"))
+        return json.loads(head + source.stream.read(source.size)), None
+    if len(head) < HEADER.size + CHUNK.size:
+        raise MeshError(broken(source.path, "is cut off", DAMAGED, "mesh_truncated"))
+    magic, version, length = HEADER.unpack_from(head)
     if magic != b"glTF" or version != 2:
-        raise MeshError(broken(path, "is no GLB of version 2"))
-    if length > size:
-        message = f"claims {length} bytes, but holds {size}"
-        raise MeshError(broken(path, message, "copy the file again in full", "mesh_truncated"))
-    json_length, kind = CHUNK.unpack(archive.read_range(path, HEADER.size, CHUNK.size))
-    at = HEADER.size + CHUNK.size
-    if kind != JSON_CHUNK or json_length > min(MAX_JSON, length - at):
-        raise MeshError(broken(path, "its JSON part is missing, cut off or too large"))
-    document = json.loads(archive.read_range(path, at, json_length))
-    at += json_length
-    binary = None
-    if at + CHUNK.size <= length:
-        binary_length, kind = CHUNK.unpack(archive.read_range(path, at, CHUNK.size))
-        if kind == BINARY_CHUNK:
-            binary = (at + CHUNK.size, binary_length)
-            if binary[0] + binary_length > size:
-                message = "its binary part is longer than the file"
-                raise MeshError(broken(path, message, "copy the file again in full", "mesh_truncated"))
-    return _File(archive, path, document, binary, {}, [])
+        raise MeshError(broken(source.path, "is no GLB of version 2"))
+    if length > source.size:
+        message = f"claims {length} bytes, but holds {source.size}"
+        raise MeshError(broken(source.path, message, DAMAGED, "mesh_truncated"))
+    json_length, kind = CHUNK.unpack_from(head, HEADER.size)
+    if kind != JSON_CHUNK or json_length > min(MAX_JSON, length - len(head)):
+        raise MeshError(broken(source.path, "its JSON part is missing, cut off or too large"))
+    document = json.loads(source.stream.read(json_length))
+    left = length - len(head) - json_length
+    if left < CHUNK.size:
+        return document, None
+    binary_length, kind = CHUNK.unpack(source.stream.read(CHUNK.size))
+    if kind != BINARY_CHUNK:
+        return document, None
+    if binary_length > left - CHUNK.size:
+        raise MeshError(broken(source.path, "its binary part is longer than the file", DAMAGED, "mesh_truncated"))
+    return document, source.stream.read(binary_length)
 
 
-def _open_json(archive: ScanArchive, path: str) -> _File:
-    return _File(archive, path, json.loads(archive.read(path, MAX_JSON)), None, {}, [])
-
-
-def _refuse_compression(file: _File) -> None:
-    required = [str(name) for name in file.document.get("extensionsRequired", [])]
+def _refuse_compression(document: Json, path: str) -> None:
+    required = [str(name) for name in document.get("extensionsRequired", [])]
     found = [name for name in COMPRESSED if name in required]
     if found:
         message = f"is compressed with {found[0]}, which is not read"
         remedy = "export it again without compression, or as PLY"
-        raise MeshError(broken(file.path, message, remedy, "mesh_compressed"))
+        raise MeshError(broken(path, message, remedy, "mesh_compressed"))
 
 
-def _item(document: Json, key: str, index: Any) -> Json:
-    if not isinstance(index, int) or index < 0:
-        raise IndexError(f"{key}[{index}]")
-    return cast(Json, document[key][index])
+def _parts(document: Json, buffers: Buffers, arithmetic: Arithmetic, path: str) -> Iterator[MeshPart]:
+    drawn = vertices = faces = 0
+    for mesh, transform in _instances(document, arithmetic):
+        for primitive in item(document, "meshes", mesh).get("primitives", []):
+            drawn += 1
+            if drawn > MAX_NODES:
+                raise ValueError(f"more than {MAX_NODES} primitives")
+            if primitive.get("mode", TRIANGLES) in (TRIANGLES, STRIP, FAN):
+                part = _part(buffers, primitive, transform)
+                vertices += len(part.positions) // 3
+                faces += len(part.triangles) // 3
+                check_counts(path, vertices, faces)
+                yield part
 
 
-def _nodes(document: Json) -> list[tuple[Json, Matrix4]]:
-    """Nodes of the default scene with their world transforms; all nodes count if there is no scene."""
+def _instances(document: Json, arithmetic: Arithmetic) -> Iterator[tuple[int, Any]]:
+    """Index and transform of each mesh that the default scene draws, depth first."""
     nodes = document.get("nodes", [])
-    if len(nodes) > MAX_NODES:
-        raise ValueError(f"more than {MAX_NODES} nodes")
-    roots = list(range(len(nodes)))
+    if not nodes:
+        yield from ((mesh, IDENTITY) for mesh in range(len(document.get("meshes", []))))
+        return
     if document.get("scenes"):
-        roots = _item(document, "scenes", document.get("scene", 0)).get("nodes", [])
-    found: list[tuple[Json, Matrix4]] = []
-    waiting = [(root, IDENTITY) for root in roots]
-    seen: set[int] = set()
+        roots = item(document, "scenes", document.get("scene", 0)).get("nodes", [])
+    else:
+        children = {child for node in nodes for child in node.get("children", [])}
+        roots = [index for index in range(len(nodes)) if index not in children]
+    waiting = [(root, IDENTITY) for root in reversed(roots)]
+    visited = 0
     while waiting:
         index, parent = waiting.pop()
-        if index in seen:
-            raise ValueError("a node has two parents")
-        seen.add(index)
-        node = _item(document, "nodes", index)
-        transform = compose(parent, _local(node))
-        found.append((node, transform))
-        waiting.extend((child, transform) for child in node.get("children", []))
-    return found
+        visited += 1
+        node = item(document, "nodes", index)
+        children = node.get("children", [])
+        if visited + len(waiting) + len(children) > MAX_NODES:
+            raise ValueError(f"more than {MAX_NODES} nodes, or nodes that contain themselves")
+        transform = arithmetic.compose(parent, _local(node))
+        if node.get("mesh") is not None:
+            yield node["mesh"], transform
+        waiting.extend((child, transform) for child in reversed(children))
 
 
 def _local(node: Json) -> Matrix4:
+    """A node's transform: `matrix` (column by column), or translation, rotation (x, y, z, w; scaled to 1) and scale."""
     if "matrix" in node:
         columns = [float(value) for value in node["matrix"]]
         return matrix4([columns[4 * column + row] for row in range(4) for column in range(4)])
-    x, y, z, w = (float(value) for value in node.get("rotation", (0, 0, 0, 1)))
-    sx, sy, sz = (float(value) for value in node.get("scale", (1, 1, 1)))
-    tx, ty, tz = (float(value) for value in node.get("translation", (0, 0, 0)))
+    rotation = [float(value) for value in node.get("rotation", (0, 0, 0, 1))]
+    length = math.hypot(*rotation)
+    x, y, z, w = (value / length for value in rotation)
+    scale = [float(value) for value in node.get("scale", (1, 1, 1))]
+    shift = [float(value) for value in node.get("translation", (0, 0, 0))]
+    rows = from_quaternion(x, y, z, w, (0, 0, 0))
+    if len(scale) != 3 or len(shift) != 3:
+        raise ValueError("a scale or translation that is no three numbers")
     return matrix4([
-        (1 - 2 * (y * y + z * z)) * sx, 2 * (x * y - z * w) * sy, 2 * (x * z + y * w) * sz, tx,
-        2 * (x * y + z * w) * sx, (1 - 2 * (x * x + z * z)) * sy, 2 * (y * z - x * w) * sz, ty,
-        2 * (x * z - y * w) * sx, 2 * (y * z + x * w) * sy, (1 - 2 * (x * x + y * y)) * sz, tz,
+        value
+        for row, moved in zip(rows, shift, strict=False)
+        for value in (row[0] * scale[0], row[1] * scale[1], row[2] * scale[2], moved)
     ])  # fmt: skip
 
 
-def _add_primitive(file: _File, primitive: Json, transform: Matrix4, mesh: RawMesh) -> None:
-    if primitive.get("mode", TRIANGLES) != TRIANGLES:
-        raise MeshError(broken(file.path, "holds points, lines or strips", "export plain triangles"))
+def _part(buffers: Buffers, primitive: Json, transform: Any) -> MeshPart:
     attributes = primitive["attributes"]
-    base = len(mesh.positions) // 3
-    positions = _accessor(file, attributes["POSITION"], "VEC3", {FLOAT: "f"})
-    check_counts(file.path, base + len(positions) // 3, 0)
+    positions = buffers.vectors(attributes["POSITION"], 3)
     if "indices" in primitive:
-        indices: Sequence[float] = _accessor(file, primitive["indices"], "SCALAR", INDEX_KINDS)
+        indices = buffers.indices(primitive["indices"])
     else:
-        indices = range(len(positions) // 3)
-    check_counts(file.path, 0, (len(mesh.triangles) + len(indices)) // 3)
-    if len(indices) % 3:
-        raise ValueError(f"{len(indices)} indices are no triangles")
-    if len(indices) and max(indices) >= len(positions) // 3:
-        message = f"a face names vertex {max(indices)} of {len(positions) // 3}, counted from 0"
-        raise MeshError(broken(file.path, message, code="mesh_index"))
-    mesh.positions.extend(positions if transform == IDENTITY else _moved(positions, transform))
-    mesh.triangles.extend(base + int(index) for index in indices)
-    mesh.has_uv = mesh.has_uv or "TEXCOORD_0" in attributes
+        indices = array("q", range(len(positions) // 3))
+    triangles = _triangles(indices, primitive.get("mode", TRIANGLES))
+    if _mirrors(transform):
+        triangles = array("q", triangles)
+        triangles[0::3], triangles[2::3] = triangles[2::3], triangles[0::3]
+    uv = buffers.vectors(attributes["TEXCOORD_0"], 2) if "TEXCOORD_0" in attributes else None
+    if uv is not None and len(uv) // 2 != len(positions) // 3:
+        uv = None
+    material = str(int(primitive["material"])) if "material" in primitive else ""
+    return MeshPart(positions, triangles, uv, v_up=False, transform=transform, materials=[(0, material)])
 
 
-def _moved(positions: array[float], transform: Matrix4) -> array[float]:
-    moved = array("f")
-    (a, b, c, d), (e, f, g, h), (i, j, k, m) = transform[:3]
-    for x, y, z in zip(positions[0::3], positions[1::3], positions[2::3], strict=True):
-        moved.extend((a * x + b * y + c * z + d, e * x + f * y + g * z + h, i * x + j * y + k * z + m))
-    return moved
+def _triangles(indices: array[int], mode: int) -> array[int]:
+    if mode == TRIANGLES:
+        return indices[: len(indices) // 3 * 3] if len(indices) % 3 else indices
+    count = max(len(indices) - 2, 0)
+    triangles = array("q", bytes(24 * count))
+    triangles[0::3] = indices[:count] if mode == STRIP else array("q", [*indices[:1]] * count)
+    triangles[1::3] = indices[1 : count + 1]
+    triangles[2::3] = indices[2:]
+    if mode == STRIP:  # every other triangle of a strip runs the other way round
+        triangles[4::6], triangles[5::6] = triangles[5::6], triangles[4::6]
+    return triangles
 
 
-def _accessor(file: _File, index: Any, shape: str, kinds: dict[int, str]) -> array[Any]:
-    """Values of an accessor as one flat array, its bounds checked against the buffer first."""
-    accessor = _item(file.document, "accessors", index)
-    kind, count = kinds.get(accessor["componentType"]), accessor["count"]
-    if kind is None or accessor["type"] != shape or "sparse" in accessor or "bufferView" not in accessor:
-        raise MeshError(broken(file.path, "stores positions or indices in a way that is not read", "export it as PLY"))
-    view = _item(file.document, "bufferViews", accessor["bufferView"])
-    width = 3 if shape == "VEC3" else 1
-    item = struct.calcsize(f"<{width}{kind}")
-    stride, offset = view.get("byteStride", item), accessor.get("byteOffset", 0)
-    start, length = view.get("byteOffset", 0), view["byteLength"]
-    if not all(type(value) is int and value >= 0 for value in (count, stride, offset, start, length)):
-        raise ValueError("a negative or fractional size")
-    buffer = _buffer(file, view["buffer"])
-    needed = offset + (count - 1) * stride + item if count else 0
-    if not item <= stride <= 252 or needed > length or start + length > len(buffer):
-        message = f"claims {count} values, more than its buffer holds"
-        raise MeshError(broken(file.path, message, "export it again", "mesh_truncated"))
-    check_counts(file.path, count // 3, 0)
-    data = memoryview(buffer)[start + offset : start + needed]
-    values = array(kind)
-    if stride == item:
-        values.extend(value for row in struct.iter_unpack(f"<{width}{kind}", data) for value in row)
-    else:
-        unpack = struct.Struct(f"<{width}{kind}").unpack_from
-        for at in range(count):
-            values.extend(unpack(data, at * stride))
-    return values
-
-
-def _buffer(file: _File, index: Any) -> bytes:
-    if index not in file.buffers:
-        buffer = _item(file.document, "buffers", index)
-        file.buffers[index] = _load_buffer(file, buffer)
-    return file.buffers[index]
-
-
-def _load_buffer(file: _File, buffer: Json) -> bytes:
-    uri = buffer.get("uri")
-    if uri is None:
-        if file.binary is None:
-            raise MeshError(broken(file.path, "its binary part is missing", code="mesh_truncated"))
-        if file.binary[1] > MAX_BUFFER:
-            raise MeshError(broken(file.path, "its binary part is too large", "decimate the mesh", "mesh_too_large"))
-        return file.archive.read_range(file.path, *file.binary)
-    if not isinstance(uri, str):
-        raise TypeError("a buffer's uri is no text")
-    if uri.startswith("data:"):
-        try:
-            return base64.b64decode(uri.partition(",")[2], validate=True)
-        except binascii.Error as error:
-            raise ValueError("an embedded buffer is no base64") from error
-    name = normpath(join(dirname(file.path), unquote(uri)))
-    if name not in file.archive:
-        message = f"refers to {uri[:100]!r}, which is not in the scan"
-        raise MeshError(broken(file.path, message, "add the file, or export a GLB", "missing_file"))
-    file.files.append(name)
-    return file.archive.read(name, MAX_BUFFER)
+def _mirrors(transform: Any) -> bool:
+    (a, b, c, _), (d, e, f, _), (g, h, i, _) = transform[:3]
+    return bool(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0)

@@ -1,15 +1,14 @@
-"""What all mesh readers return, and the checks that do not depend on the file's kind."""
+"""What reading a mesh gives, and the checks that do not depend on the file's kind."""
 
 from __future__ import annotations
 
 import math
-from array import array
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from advtex_scan.errors import Finding, MeshError
-
-MAX_ELEMENTS = 10_000_000  # vertices, and triangles; ScanNet's finest meshes hold about 5 million
-Vector = tuple[float, float, float]
+from advtex_scan.mesh._arithmetic import Arithmetic, Vector
+from advtex_scan.mesh._part import MeshPart, broken, check_counts
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,23 +28,20 @@ class MeshFacts:
         return f"{self.path}: {self.vertices} vertices, {self.faces} triangles, {uv}, {sides} m"
 
 
-@dataclass(slots=True)
-class RawMesh:
-    """positions: x, y, z of each vertex in turn (float32); triangles: three vertex indices each."""
-
-    positions: array[float] = field(default_factory=lambda: array("f"))
-    triangles: array[int] = field(default_factory=lambda: array("q"))
-    has_uv: bool = False
-    files: tuple[str, ...] = ()
-
-
 @dataclass(frozen=True, slots=True)
 class MeshSurface:
-    """A checked mesh. `files`: other files of the scan that it refers to."""
+    """A checked mesh in world coordinates.
 
-    positions: array[float]
-    triangles: array[int]
+    positions: x, y, z of each vertex in turn, metres (float32, format "f")
+    triangles: three vertex indices each (int64, format "q")
+    parts: what the file holds, uv and materials too; uv of some parts alone are to be passed over (`facts.has_uv`)
+    files: other files of the scan that it refers to
+    """
+
+    positions: memoryview
+    triangles: memoryview
     facts: MeshFacts
+    parts: tuple[MeshPart, ...]
     files: tuple[str, ...] = ()
 
     def corner(self, index: int) -> Vector:
@@ -58,18 +54,6 @@ class MeshSurface:
         return triangle_area(*(self.corner(3 * triangle + k) for k in range(3)))
 
 
-def broken(path: str, message: str, remedy: str = "write the mesh again with a common tool", code: str = "") -> Finding:
-    """The finding for a mesh that cannot be used."""
-    return Finding("error", code or "bad_mesh", path, message, remedy)
-
-
-def check_counts(path: str, vertices: int, faces: int) -> None:
-    """Refuse counts beyond what is read at all."""
-    if vertices > MAX_ELEMENTS or faces > MAX_ELEMENTS:
-        message = f"claims {vertices} vertices and {faces} faces; at most {MAX_ELEMENTS} of each are accepted"
-        raise MeshError(broken(path, message, "decimate the mesh", "mesh_too_large"))
-
-
 def triangle_area(a: Vector, b: Vector, c: Vector) -> float:
     """Half the length of the cross product of two edges."""
     ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
@@ -77,28 +61,39 @@ def triangle_area(a: Vector, b: Vector, c: Vector) -> float:
     return 0.5 * math.hypot(uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx)
 
 
-def finish(raw: RawMesh, path: str) -> MeshSurface:
-    """Check a mesh's content; MeshError with everything that is wrong."""
-    vertices, faces = len(raw.positions) // 3, len(raw.triangles) // 3
-    findings: list[Finding] = []
+def finish(parts: Sequence[MeshPart], path: str, files: Sequence[str], arithmetic: Arithmetic) -> MeshSurface:
+    """Join and check what a file holds. Raises MeshError with everything that is wrong."""
+    vertices = sum(len(part.positions) for part in parts) // 3
+    faces = sum(len(part.triangles) for part in parts) // 3
+    check_counts(path, vertices, faces)
+    findings = [finding for part in parts for finding in _out_of_range(part, path, arithmetic)][:1]
     if faces == 0:
         findings.append(broken(path, "has no faces", "give a triangle mesh, not a point cloud", "mesh_no_faces"))
-    if faces and not (min(raw.triangles) >= 0 and max(raw.triangles) < vertices):
-        worst = min(raw.triangles) if min(raw.triangles) < 0 else max(raw.triangles)
-        message = f"a face names vertex {worst}, but there are {vertices}, counted from 0"
-        findings.append(broken(path, message, code="mesh_index"))
-    if not all(map(math.isfinite, raw.positions)):
-        bad = sum(not math.isfinite(value) for value in raw.positions)
+    positions = arithmetic.placed(parts)
+    if bad := arithmetic.count_not_finite(positions):
         message = f"{bad} vertex coordinates are NaN or infinite"
         findings.append(broken(path, message, "remove those vertices", "mesh_nan"))
     if findings:
         raise MeshError(*findings)
-    axes = [raw.positions[axis::3] for axis in range(3)]
-    low, high = (min(axes[0]), min(axes[1]), min(axes[2])), (max(axes[0]), max(axes[1]), max(axes[2]))
-    surface = MeshSurface(
-        raw.positions, raw.triangles, MeshFacts(path, vertices, faces, raw.has_uv, (low, high)), raw.files
-    )
+    has_uv = all(part.uv is not None for part in parts)
+    facts = MeshFacts(path, vertices, faces, has_uv, arithmetic.bounds(positions))
+    surface = MeshSurface(positions, arithmetic.joined(parts), facts, tuple(parts), tuple(files))
     if not any(surface.area(triangle) > 0 for triangle in range(faces)):
         message = "all faces have zero area"
         raise MeshError(broken(path, message, "check how the mesh was written", "mesh_zero_area"))
     return surface
+
+
+def _out_of_range(part: MeshPart, path: str, arithmetic: Arithmetic) -> list[Finding]:
+    findings = []
+    for what, indices, values, width in (
+        ("vertex", part.triangles, part.positions, 3),
+        ("texture coordinate", part.uv_triangles, part.uv, 2),
+    ):
+        if indices and values is not None:
+            low, high = arithmetic.extremes(indices)
+            count = len(values) // width
+            if low < 0 or high >= count:
+                message = f"a face names {what} {low if low < 0 else high}, but there are {count}, counted from 0"
+                findings.append(broken(path, message, code="mesh_index"))
+    return findings

@@ -159,8 +159,8 @@ def edit(path: Path, old: str, new: str) -> None:
         ("model.mtl", "model.png", "lost.png", r"lost\.png: cannot be read"),
         ("model.obj", "model.mtl", "lost.mtl", r"lost\.mtl: cannot be read"),
         ("model.obj", "vt 0.1", "vt -1.1", "texture repeats"),
-        ("model.obj", "vt ", "# ", "texture coordinate indices out of range|line that cannot be read"),
-        ("model.obj", "\nf ", "\n# ", "the mesh has no faces"),
+        ("model.obj", "vt ", "# ", "a face names texture coordinate"),
+        ("model.obj", "\nf ", "\n# ", "has no faces"),
     ],
 )
 def test_an_obj_that_cannot_be_used_is_refused(files: Path, file: str, old: str, new: str, message: str) -> None:
@@ -202,7 +202,7 @@ def rewrite_glb(path: Path, change: Any) -> None:
         (lambda document: document["images"][0].pop("bufferView"), "not stored in the GLB"),
         (lambda document: document.pop("images"), "not stored in the GLB"),
         (lambda document: document["meshes"][0]["primitives"][0]["attributes"].pop("TEXCOORD_0"), "unwrap"),
-        (lambda document: document["accessors"][0].update(count=10**9), "is longer than its buffer view"),
+        (lambda document: document["accessors"][0].update(count=10**9), "more than its buffer holds"),
     ],
 )
 def test_a_glb_that_cannot_be_used_is_refused(files: Path, change: Any, message: str) -> None:
@@ -213,7 +213,7 @@ def test_a_glb_that_cannot_be_used_is_refused(files: Path, change: Any, message:
 
 def test_a_truncated_glb_and_other_formats_are_refused(files: Path) -> None:
     (files / "model.glb").write_bytes((files / "model.glb").read_bytes()[:-100])
-    with pytest.raises(ModelError, match="incomplete"):
+    with pytest.raises(ModelError, match=r"claims \d+ bytes, but holds"):
         load_model(files / "model.glb")
     with pytest.raises(ModelError, match="only OBJ and GLB"):
         load_model(files / "model.fbx")

@@ -20,9 +20,10 @@ from advtex_engine.core.errors import Problem, ScanError
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Mesh
 from advtex_engine.ingest.read import opened
-from advtex_engine.mesh.read import load_mesh
+from advtex_engine.mesh.read import NUMPY, to_mesh
 from advtex_scan.archive import ScanArchive
 from advtex_scan.check import read_scan
+from advtex_scan.errors import ScanFormatError
 from advtex_scan.manifest import MeshEntry, ScanManifest
 
 HOPELESS_SHARE = 0.35
@@ -81,14 +82,17 @@ class DeepCheck:
 def deep_check(scan: Path, layout: str | None = None) -> DeepCheck | None:
     """Measures a scan (folder or zip); None if it has too little to be measured. Raises ScanError if it is broken."""
     with opened(scan) as archive:
-        manifest = read_scan(archive, layout).manifest
+        reading = read_scan(archive, layout, NUMPY)
+        manifest = reading.manifest
         if manifest is None:
             raise ScanError(
                 Problem("unknown_layout", scan.name, "is no scan of a known layout", "see `advtex-client check`")
             )
         mesh = None
         if manifest.mesh is not None:
-            mesh = _placed(load_mesh(archive, manifest.mesh.path), manifest.mesh)
+            if reading.mesh is None:
+                raise ScanFormatError(*(found for found in reading.report.findings if found.severity == "error"))
+            mesh = _placed(to_mesh(reading.mesh), manifest.mesh)
         return check_conventions(archive, manifest, mesh)
 
 

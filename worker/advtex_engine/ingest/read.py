@@ -40,7 +40,7 @@ from advtex_engine.ingest.frames import Capture, Frame, FrameStore, StoredFrame,
 from advtex_engine.ingest.thumbnails import thumbnail_of
 from advtex_engine.ingest.video import VideoReader
 from advtex_engine.mesh.fusion import fuse
-from advtex_engine.mesh.read import load_mesh
+from advtex_engine.mesh.read import NUMPY, to_mesh
 from advtex_engine.runtime.threads import in_threads
 from advtex_scan.archive import ScanArchive, open_scan
 from advtex_scan.check import read_scan
@@ -83,14 +83,20 @@ def read_capture(
     on_mesh: told the scan's own mesh, if it brings one, before its frames are decoded.
     """
     with opened(scan) as archive:
-        reading = read_scan(archive, config.layout)
-        errors = [_problem(finding) for finding in reading.report.findings if finding.severity == "error"]
-        if errors or reading.manifest is None:
-            raise ScanError(*errors)
-        for finding in reading.report.findings:
-            if finding.severity == "warning":
-                monitor.warning(_problem(finding))
-        return _capture(archive, reading.manifest, config, store, monitor, on_mesh)
+        manifest, mesh, warnings = sound_scan(archive, config.layout)
+        for warning in warnings:
+            monitor.warning(warning)
+        return _capture(archive, manifest, mesh, config, store, monitor, on_mesh)
+
+
+def sound_scan(archive: ScanArchive, layout: str | None) -> tuple[ScanManifest, Mesh | None, list[Problem]]:
+    """A scan's manifest, its mesh as it lies in the file, and warnings. Raises ScanError with one problem per error."""
+    reading = read_scan(archive, layout, NUMPY)
+    errors = [_problem(finding) for finding in reading.report.findings if finding.severity == "error"]
+    if errors or reading.manifest is None:
+        raise ScanError(*errors)
+    warnings = [_problem(finding) for finding in reading.report.findings if finding.severity == "warning"]
+    return reading.manifest, None if reading.mesh is None else to_mesh(reading.mesh), warnings
 
 
 @contextmanager
@@ -103,10 +109,12 @@ def opened(scan: Path) -> Iterator[ScanArchive]:
         raise ScanError(*map(_problem, error.findings)) from error
 
 
-def load_scene(archive: ScanArchive, manifest: ScanManifest, config: TextureConfig, monitor: Monitor) -> Scene:
-    """`ingest` for a scan that is open and described by a sound manifest."""
+def load_scene(
+    archive: ScanArchive, manifest: ScanManifest, mesh: Mesh | None, config: TextureConfig, monitor: Monitor
+) -> Scene:
+    """`ingest` for a scan that is open and sound. mesh: as it lies in the file that the manifest names."""
     with FrameStore() as store:
-        return _with_mesh(_capture(archive, manifest, config, store, monitor), monitor)
+        return _with_mesh(_capture(archive, manifest, mesh, config, store, monitor), monitor)
 
 
 def _with_mesh(capture: Capture, monitor: Monitor) -> Scene:
@@ -117,14 +125,15 @@ def _with_mesh(capture: Capture, monitor: Monitor) -> Scene:
 def _capture(
     archive: ScanArchive,
     manifest: ScanManifest,
+    mesh: Mesh | None,
     config: TextureConfig,
     store: FrameStore,
     monitor: Monitor,
     on_mesh: OnMesh | None = None,
 ) -> Capture:
-    entry, mesh = manifest.mesh, None
-    if entry is not None:
-        mesh = _placed(load_mesh(archive, entry.path), entry.mesh_to_world)
+    entry = manifest.mesh
+    if entry is not None and mesh is not None:
+        mesh = _placed(mesh, entry.mesh_to_world)
         if on_mesh is not None:
             on_mesh(mesh, entry.refinement)
     # A mesh that is placed roughly, to be moved onto the depth, says nothing about the depth.

@@ -5,14 +5,12 @@ Several textures, as an atlas of several pages has, become one: a grid of the im
 
 from __future__ import annotations
 
-import json
 import math
-import struct
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -21,9 +19,9 @@ from torch import Tensor
 
 from advtex_engine.core.errors import EngineError
 from advtex_engine.core.scene import Atlas, Mesh
-from advtex_engine.mesh.gltf import BINARY_CHUNK, JSON_CHUNK, read_gltf
-from advtex_engine.mesh.polygons import MeshFormatError, Polygons, triangulate
-from advtex_engine.mesh.read import read_obj, read_ply
+from advtex_engine.mesh.read import NUMPY, to_mesh
+from advtex_scan.errors import MeshError
+from advtex_scan.mesh import MeshSource, MeshSurface, open_gltf, parse_mesh
 
 MAX_SIDE = 16384
 """Texels: the largest side of a texture that is put together from pages."""
@@ -46,10 +44,9 @@ def load_model(path: Path) -> tuple[Atlas, Tensor]:
     if suffix not in (".obj", ".glb"):
         raise ModelError(f"{path}: only OBJ and GLB models are read; export the model as one of them")
     with _reading(path):
-        data = path.read_bytes()
-        polygons = _polygons(path, data)
-        mesh = triangulate(polygons)
-        images = _obj_images(path, data) if suffix == ".obj" else _glb_images(path, data)
+        surface = _surface(path)
+        mesh = to_mesh(surface)
+        images = _obj_images(path) if suffix == ".obj" else _glb_images(path)
     if mesh.v_uv is None:
         raise ModelError(f"{path}: not every face has texture coordinates; unwrap the model first")
     if float(mesh.v_uv.min()) < -UV_SLACK or float(mesh.v_uv.max()) > 1 + UV_SLACK:
@@ -58,7 +55,7 @@ def load_model(path: Path) -> tuple[Atlas, Tensor]:
         if len(set(images.values())) == 1:
             image = _decode(path, next(iter(images.values())))
             return Atlas(mesh, image.shape[1], image.shape[0], "scan", 0), image
-        return _paged(path, mesh, polygons, images)
+        return _paged(path, mesh, surface, images)
 
 
 def load_reference(path: Path) -> Mesh:
@@ -66,7 +63,7 @@ def load_reference(path: Path) -> Mesh:
     if path.suffix.lower() not in (".ply", ".obj", ".glb"):
         raise ModelError(f"{path}: only PLY, OBJ and GLB meshes are read; export the mesh as one of them")
     with _reading(path):
-        return triangulate(_polygons(path, path.read_bytes()))
+        return to_mesh(_surface(path))
 
 
 @contextmanager
@@ -75,24 +72,46 @@ def _reading(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise ModelError(f"{error.filename or path}: cannot be read ({error.strerror or error})") from error
-    except MeshFormatError as error:
-        raise ModelError(f"{path}: the mesh {error}; export it again in triangles and without compression") from error
+    except MeshError as error:
+        raise ModelError(str(error)) from error
 
 
-def _polygons(path: Path, data: bytes) -> Polygons:
-    suffix = path.suffix.lower()
-    if suffix == ".glb":
-        return read_gltf(data, path.name, lambda name: (path.parent / name).read_bytes())
-    return read_ply(data) if suffix == ".ply" else read_obj(data)
+@contextmanager
+def _source(path: Path) -> Iterator[MeshSource]:
+    with path.open("rb") as stream:
+        yield MeshSource(str(path), stream, path.stat().st_size, lambda name, _limit: Path(name).read_bytes())
 
 
-def _paged(path: Path, mesh: Mesh, polygons: Polygons, images: Mapping[str, bytes]) -> tuple[Atlas, Tensor]:
+def _surface(path: Path) -> MeshSurface:
+    with _source(path) as source:
+        return parse_mesh(source, NUMPY)
+
+
+def _materials(surface: MeshSurface) -> tuple[list[str], Tensor]:
+    """The names of the materials that triangles use, in the file's order, and each triangle's [T], as its place there.
+
+    Those of a GLB are numbers, in their order.
+    """
+    runs = list[tuple[str, int]]()
+    for part in surface.parts:
+        ends = [*part.materials, (len(part.triangles) // 3, "")]
+        runs += [(name, after - first) for (first, name), (after, _) in pairwise(ends)]
+    names = list(dict.fromkeys(name for name, _ in runs))
+    if not surface.parts[0].v_up:
+        names.sort(key=lambda name: int(name or -1))
+    place = {name: number for number, name in enumerate(names)}
+    places = torch.tensor([place[name] for name, _ in runs])
+    used, of_triangle = torch.unique(
+        places.repeat_interleave(torch.tensor([count for _, count in runs])), return_inverse=True
+    )
+    return [names[number] for number in used.tolist()], of_triangle
+
+
+def _paged(path: Path, mesh: Mesh, surface: MeshSurface, images: Mapping[str, bytes]) -> tuple[Atlas, Tensor]:
     """The images that faces use as the pages of one texture. images: encoded, by the name of their material."""
     assert mesh.v_uv is not None
     assert mesh.t_uv_idx is not None
-    assert polygons.material is not None
-    numbers, of_face = np.unique(np.repeat(polygons.material, np.maximum(polygons.sizes - 2, 0)), return_inverse=True)
-    names = [polygons.materials[number] if 0 <= number < len(polygons.materials) else "" for number in numbers]
+    names, of_face = _materials(surface)
     if not all(name in images for name in names):
         count = len(set(images.values()))
         raise ModelError(f"{path}: the model has {count} textures, and faces without one; bake it into one atlas")
@@ -109,7 +128,7 @@ def _paged(path: Path, mesh: Mesh, polygons: Polygons, images: Mapping[str, byte
     for number, page in enumerate(pages):
         row, column = divmod(number, count)
         texture[row * height : (row + 1) * height, column * width : (column + 1) * width] = page
-    page_of_face = torch.tensor([encoded.index(images[name]) for name in names])[torch.from_numpy(of_face)]
+    page_of_face = torch.tensor([encoded.index(images[name]) for name in names])[of_face]
     keys = mesh.t_uv_idx * len(pages) + page_of_face[:, None]
     used, t_uv_idx = torch.unique(keys, return_inverse=True)
     page = used % len(pages)
@@ -121,10 +140,10 @@ def _paged(path: Path, mesh: Mesh, polygons: Polygons, images: Mapping[str, byte
     return atlas, texture
 
 
-def _obj_images(path: Path, data: bytes) -> dict[str, bytes]:
+def _obj_images(path: Path) -> dict[str, bytes]:
     """Encoded textures by the material that shows them."""
     files = dict[str, Path]()
-    for library in _values(data, b"mtllib"):
+    for library in _values(path.read_bytes(), b"mtllib"):
         material = ""
         for line in (path.parent / library).read_bytes().splitlines():
             material = next(iter(_values(line, b"newmtl")), material)
@@ -143,14 +162,10 @@ def _values(text: bytes, key: bytes) -> list[str]:
     return [line[len(key) :].decode("latin-1").strip() for line in lines if line.startswith((key + b" ", key + b"\t"))]
 
 
-def _glb_images(path: Path, data: bytes) -> dict[str, bytes]:
+def _glb_images(path: Path) -> dict[str, bytes]:
     """Encoded textures by the number of the material that shows them."""
-    chunks, offset = dict[int, bytes](), 12
-    while offset + 8 <= len(data):
-        length, kind = struct.unpack_from("<II", data, offset)
-        chunks.setdefault(kind, data[offset + 8 : offset + 8 + length])
-        offset += 8 + length
-    document: dict[str, Any] = json.loads(chunks[JSON_CHUNK])
+    with _source(path) as source:
+        document, binary = open_gltf(source)
     images = dict[str, bytes]()
     try:
         for number, material in enumerate(document.get("materials", [])):
@@ -159,7 +174,7 @@ def _glb_images(path: Path, data: bytes) -> dict[str, bytes]:
             texture = document["textures"][material["pbrMetallicRoughness"]["baseColorTexture"]["index"]]
             view = document["bufferViews"][document["images"][texture["source"]]["bufferView"]]
             start = view.get("byteOffset", 0)
-            images[str(number)] = chunks[BINARY_CHUNK][start : start + view["byteLength"]]
+            images[str(number)] = (binary or b"")[start : start + view["byteLength"]]
     except (LookupError, TypeError) as error:
         raise ModelError(f"{path}: the texture is not stored in the GLB; export it with images embedded") from error
     if not images:

@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 from advtex_engine.core.config import TextureConfig
-from advtex_engine.core.errors import EngineError, Problem, ScanError
+from advtex_engine.core.errors import EngineError
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import TO_Y_UP, Atlas, Fragments, Mesh, Scene, View, evenly_spread
-from advtex_engine.ingest.read import load_scene
+from advtex_engine.ingest.read import load_scene, opened, sound_scan
 from advtex_engine.mesh.models import load_model, load_reference
 from advtex_engine.metrics.image_metrics import METRICS, nearest_patch_loss
 from advtex_engine.metrics.lpips import Lpips, WeightsError, load_lpips
@@ -32,9 +32,6 @@ from advtex_engine.render.render_view import render_layers
 from advtex_engine.runtime.available_memory import available_memory
 from advtex_engine.runtime.files import json_text, write_atomically
 from advtex_engine.runtime.threads import in_threads, one_thread_each
-from advtex_scan.archive import open_scan
-from advtex_scan.check import read_scan
-from advtex_scan.errors import Finding, ScanFormatError
 
 DEPTH_AGREEMENT = 0.05
 """Metres between the depths of device, scan's mesh and model."""
@@ -221,28 +218,16 @@ def write_json(path: Path, evaluation: Evaluation, described: dict[str, Any]) ->
 
 def _load_views(scan: Path, config: TextureConfig, monitor: Monitor) -> Scene:
     """The scan with the evaluated frames as its views; the others are not decoded."""
-    try:
-        with open_scan(scan) as archive:
-            reading = read_scan(archive, config.layout)
-            errors = [finding for finding in reading.report.findings if finding.severity == "error"]
-            if errors or reading.manifest is None:
-                raise ScanError(*map(_problem, errors))
-            every = config.holdout
-            frames = tuple(
-                frame
-                for position, frame in enumerate(reading.manifest.frames)
-                if every is None or position % every == every // 2
-            )
-            if not frames:
-                raise EngineError(f"{scan}: no frame is held out; lower the holdout below {every}")
-            manifest = replace(reading.manifest, frames=frames)
-            return load_scene(archive, manifest, replace(config, holdout=None), monitor)
-    except ScanFormatError as error:
-        raise ScanError(*map(_problem, error.findings)) from error
-
-
-def _problem(finding: Finding) -> Problem:
-    return Problem(finding.code, finding.where, finding.message, finding.remedy)
+    with opened(scan) as archive:
+        manifest, mesh, _ = sound_scan(archive, config.layout)
+        every = config.holdout
+        frames = tuple(
+            frame for position, frame in enumerate(manifest.frames) if every is None or position % every == every // 2
+        )
+        if not frames:
+            raise EngineError(f"{scan}: no frame is held out; lower the holdout below {every}")
+        manifest = replace(manifest, frames=frames)
+        return load_scene(archive, manifest, mesh, replace(config, holdout=None), monitor)
 
 
 def _from_y_up(mesh: Mesh, up_axis: str) -> Mesh:

@@ -14,6 +14,7 @@ uniform in [-e_g, e_g], smoothed by three Laplacian steps, and moves by it along
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
@@ -34,12 +35,13 @@ from numpy.typing import NDArray
 from advtex_engine.core.cameras import camera_to_world
 from advtex_engine.core.errors import OptionError
 from advtex_engine.core.scene import Atlas, Camera, Mesh
-from advtex_engine.mesh.read import read_obj
+from advtex_engine.mesh.read import NUMPY, to_mesh
 from advtex_engine.metrics.image_metrics import score_views
 from advtex_engine.render.rasterize import rasterize
 from advtex_engine.render.render_view import render_layers, render_view
 from advtex_engine.results.export import export_model, vertex_normals
 from advtex_engine.synthetic import object as synthetic_object
+from advtex_scan.mesh import MeshSource, parse_mesh
 
 CAMERA_ERROR = 0.002
 """e_t in metres. At DISTANCE it shifts a 320x240 frame by up to 1.7 pixels per axis, and the turn that goes with it as
@@ -150,15 +152,9 @@ def compare_to_truth(model: Path, scan: Path) -> dict[str, float]:
 
 def _load_model(obj: bytes, read: Callable[[str], bytes]) -> tuple[Atlas, torch.Tensor]:
     """An OBJ of triangles with one texture, and that texture [H,W,3] uint8; `read` gets the files that it names."""
-    polygons = read_obj(obj)
-    assert polygons.uv is not None
-    assert polygons.uv_corners is not None
-    mesh = Mesh(
-        v_pos=torch.from_numpy(polygons.position).float(),
-        t_pos_idx=torch.from_numpy(polygons.corners).view(-1, 3),
-        v_uv=torch.from_numpy(polygons.uv).float(),
-        t_uv_idx=torch.from_numpy(polygons.uv_corners).view(-1, 3),
-    )
+    source = MeshSource("model.obj", io.BytesIO(obj), len(obj), lambda name, _limit: read(name))
+    mesh = to_mesh(parse_mesh(source, NUMPY))
+    assert mesh.v_uv is not None
     mtl = read(_value_of(obj, b"mtllib"))
     image = cv2.imdecode(np.frombuffer(read(_value_of(mtl, b"map_Kd")), np.uint8), cv2.IMREAD_COLOR)
     assert image is not None

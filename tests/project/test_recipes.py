@@ -15,7 +15,7 @@ from tiny_scan import FOCAL, HEIGHT, PLY, WIDTH, png
 
 ROOT = Path(__file__).parents[2]
 ROOMS = ("client", "server", "worker")
-LEFT_OUT = shutil.ignore_patterns("__pycache__", "node_modules", "results", "vendor")
+LEFT_OUT = shutil.ignore_patterns("__pycache__", "node_modules")
 
 
 def blocks(title: str) -> list[tuple[str, str]]:
@@ -77,7 +77,7 @@ def run(root: Path, *arguments: object, **environment: str) -> str:
 
 @pytest.fixture
 def copy(tmp_path: Path) -> Path:
-    """The tree without what can be made again."""
+    """The tree, without what was made."""
     root = tmp_path / "tree"
     for name in (*ROOMS, "tests"):
         shutil.copytree(ROOT / name, root / name, ignore=LEFT_OUT)
@@ -154,3 +154,28 @@ def test_an_endpoint_is_added(copy: Path, tmp_path: Path) -> None:
     assert after.keys() - before.keys() == {"/v1/load"}
     run(copy, *kept)
     assert run(copy, "-c", ENDPOINT, tmp_path / "data").splitlines()[-1] == "0 0"  # after the log
+
+
+@pytest.mark.slow
+def test_a_method_is_added(copy: Path, tmp_path: Path) -> None:
+    follow("Add a method", copy)
+    engine, small = ("-m", "advtex_engine"), ("--size", "96x72")
+    run(copy, *engine, "synthesize", tmp_path / "scan.zip", "--views", 6, *small)
+    flags = ("--method", "first_view", "--preset", "preview", "--no-refine", "--device", "cpu", *small)
+    run(copy, *engine, "texture", tmp_path / "scan.zip", "-o", tmp_path / "out", *flags)
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["options"]["method"] == "first_view"
+    assert "first_view: each face" in run(copy, "-c", "from advtex_client.cli import main; main()", "submit", "--help")
+
+
+OPTION = """
+from advtex_contract.options import JobOptions
+from advtex_worker.adapt import texture_config
+print(texture_config(JobOptions(texels_per_pixel=2), "cpu").texels_per_pixel)
+"""
+
+
+def test_an_option_is_added(copy: Path) -> None:
+    follow("Add an option", copy)
+    assert run(copy, "-c", OPTION) == "2.0\n"
+    assert "--texels-per-pixel" in run(copy, "-m", "advtex_engine", "texture", "--help")

@@ -6,6 +6,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
+PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --constraint constraints.txt
 RUFF := $(BIN)/ruff
 
 .PHONY: install test demo clean
@@ -19,7 +20,8 @@ $(STAMP): pyproject.toml constraints.txt
 	    echo "$(PYTHON) cannot make a .venv: apt-get install python3-venv, then run make again" >&2; exit 1; }
 	@echo "installing into .venv ..."
 	@$(PYTHON) -m venv .venv
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check --constraint constraints.txt --editable '.[all,dev]'
+	@$(PIP) --upgrade pip  # the one that came with Python may not know dependency groups
+	@$(PIP) --editable '.[all]' --group dev
 	@touch $@
 
 test: install

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import httpx
@@ -11,6 +10,7 @@ from advtex_client._calls import Call
 from advtex_client.config import ClientConfig
 from advtex_client.errors import IntegrityError
 from advtex_contract.jobs import ResultFile
+from advtex_scan.version import product_version
 
 LIMITS = httpx.Limits(max_connections=10)
 TIMEOUT = httpx.Timeout(60.0, connect=10.0)
@@ -18,11 +18,7 @@ UPLOAD_TIMEOUT = httpx.Timeout(60.0, connect=10.0, read=600.0)  # the answer com
 
 
 def base_headers(config: ClientConfig) -> dict[str, str]:
-    try:
-        release = version("advtex")
-    except PackageNotFoundError:  # run from a source tree
-        release = "0"
-    headers = {"User-Agent": f"advtex-client/{release}"}
+    headers = {"User-Agent": f"advtex-client/{product_version()}"}
     return headers | {"Authorization": f"Bearer {config.api_key}"} if config.api_key else headers
 
 

@@ -43,6 +43,7 @@ from advtex_client.errors import ScanRejectedError
 from advtex_contract.jobs import TERMINAL, JobState, JobView
 from advtex_contract.options import Method, Preset
 from advtex_scan.check import check_scan
+from advtex_scan.version import product_version
 
 RETRYABLE = (JobState.failed, JobState.canceled)
 
@@ -54,6 +55,21 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 app.add_typer(cli_batch.app, name="batch")
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"advtex-client {product_version()}")
+        raise typer.Exit
+
+
+@app.callback()
+def advtex_client(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and exit")
+    ] = False,
+) -> None:
+    """What all commands have in common."""
 
 
 @app.command()

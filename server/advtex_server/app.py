@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
-from importlib.metadata import PackageNotFoundError, version
 
 from fastapi import FastAPI
 
+from advtex_scan.version import product_version
 from advtex_server import errors
 from advtex_server.access import AccessMiddleware
 from advtex_server.bodies import OpenBodies
@@ -53,7 +53,7 @@ def create_app(settings: ServerSettings) -> FastAPI:
 
     app = FastAPI(
         title="advtex",
-        version=_version(),
+        version=product_version(),
         summary="Sharp textures from RGB-D scans",
         lifespan=lifespan,
         responses=ANYWHERE,
@@ -78,10 +78,3 @@ def create_app(settings: ServerSettings) -> FastAPI:
     for module in (webhooks, uploads, jobs, batches, health, pages):
         app.include_router(module.router)
     return app
-
-
-def _version() -> str:
-    try:
-        return version("advtex")
-    except PackageNotFoundError:  # run from a checkout
-        return "0"

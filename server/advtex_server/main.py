@@ -11,6 +11,7 @@ from typing import Annotated
 
 import typer
 
+from advtex_scan.version import product_version
 from advtex_server.embedded import SetupError
 from advtex_server.health import checks
 from advtex_server.serving import serve as run_server
@@ -30,6 +31,22 @@ app = typer.Typer(
 )
 keys = typer.Typer(no_args_is_help=True, help="API keys.")
 app.add_typer(keys, name="keys")
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"advtex-server {product_version()}")
+        raise typer.Exit
+
+
+@app.callback()
+def advtex_server(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and exit")
+    ] = False,
+) -> None:
+    """What all commands have in common."""
+
 
 Host = Annotated[str, typer.Option(help="address to listen on")]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one")]

@@ -22,6 +22,7 @@ import redis
 import yaml
 from live_service import process_tree, wait_until
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 from tiny_scan import write_scan, write_zip
@@ -57,9 +58,13 @@ def packages() -> set[str]:
 
 
 def requirements() -> list[Requirement]:
-    """Everything that this project asks for by name, extras included."""
+    """Everything that this project asks for by name, extras and groups included."""
     project = PROJECT["project"]
-    lists = [project["dependencies"], *project["optional-dependencies"].values()]
+    lists = [
+        project["dependencies"],
+        *project["optional-dependencies"].values(),
+        *PROJECT["dependency-groups"].values(),
+    ]
     found = [Requirement(line) for lines in lists for line in lines]
     return [requirement for requirement in found if requirement.name != "advtex"]
 
@@ -77,6 +82,18 @@ class TestPins:
 
     def test_pins_fit_every_build_of_a_version(self) -> None:
         assert [name for name, version in pins().items() if version.local] == []
+
+    def test_the_pip_that_installs_knows_dependency_groups(self) -> None:
+        assert pins()["pip"] >= Version("25.1")
+
+    def test_the_makefile_asks_for_the_same_python_as_the_package(self) -> None:
+        bounds = re.search(r"\((\d), (\d+)\) <= v < \((\d), (\d+)\)", (ROOT / "Makefile").read_text())
+        assert bounds is not None
+        least, below = ".".join(bounds.group(1, 2)), ".".join(bounds.group(3, 4))
+        assert SpecifierSet(PROJECT["project"]["requires-python"]) == SpecifierSet(f">={least},<{below}")
+        named = [line.rpartition(" ")[2] for line in PROJECT["project"]["classifiers"] if " :: 3." in line]
+        assert named[0] == least
+        assert all(Version(name) < Version(below) for name in named)
 
 
 class TestPackages:

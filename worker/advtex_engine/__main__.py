@@ -16,6 +16,7 @@ from advtex_engine.core.config import METHODS, PRESETS, TextureConfig
 from advtex_engine.core.errors import EngineError, OptionError, Problem, Stopped
 from advtex_engine.core.monitor import Monitor
 from advtex_scan.layouts import LAYOUT_NAMES
+from advtex_scan.version import product_version
 
 
 class _Printer(Monitor):
@@ -78,6 +79,7 @@ def parse_size(text: str) -> tuple[int, int]:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="advtex-engine", description=__doc__)
+    parser.add_argument("--version", action="version", version=f"advtex-engine {product_version()}")
     commands = parser.add_subparsers(dest="command", required=True)
     texture = commands.add_parser("texture", help="texture a scan (folder or zip)")
     texture.add_argument("scan", type=Path)

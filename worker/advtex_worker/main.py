@@ -26,6 +26,7 @@ from rq import Worker
 from rq.exceptions import StopRequested
 from rq.serializers import JSONSerializer
 
+from advtex_scan.version import product_version
 from advtex_store.logs import configure_logs
 from advtex_store.queue import JobQueue, attempt_of, class_of, connect_redis, queue_name
 from advtex_store.secrecy import hide_environment
@@ -166,7 +167,9 @@ def work(host: Host, slot: Slot) -> None:
 
 
 def main() -> None:
-    argparse.ArgumentParser(prog="advtex-worker", description=__doc__).parse_args()
+    parser = argparse.ArgumentParser(prog="advtex-worker", description=__doc__)
+    parser.add_argument("--version", action="version", version=f"advtex-worker {product_version()}")
+    parser.parse_args()
     try:
         settings = WorkerSettings()
     except ValidationError as error:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import importlib
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -426,3 +428,20 @@ def test_the_kernels_compile_for_gpus_that_are_not_here(tmp_path: Path, capabili
     )
     assert done.returncode == 0, done.stderr
     assert len(done.stdout.splitlines()) == 25
+
+
+def test_every_kernel_describes_its_parameters(fused: ModuleType) -> None:
+    """What is launched names each pointer and number that it is given in its docstring; constants may speak for
+    themselves."""
+    described = 0
+    for module in (fused.kernels, fused_losses.kernels, fused_offsets.kernels):
+        tree = ast.parse(Path(module.__file__).read_text(encoding="utf-8"))
+        for function in (node for node in tree.body if isinstance(node, ast.FunctionDef)):
+            if not any(isinstance(node, ast.Attribute) and node.attr == "store" for node in ast.walk(function)):
+                continue  # a helper: what it returns is stored by the kernels
+            given = [argument.arg for argument in function.args.args if argument.annotation is None]
+            text = ast.get_docstring(function) or ""
+            words = set(re.findall(r"\w+", text.partition("\n\n")[2]))
+            assert set(given) <= words, f"{function.name}: {sorted(set(given) - words)}"
+            described += len(given)
+    assert described > 80

@@ -1,7 +1,9 @@
 """Triton kernels of a step's images; `triton_operations.py` launches them and names each one's plain twin in torch.
 
-One program does BLOCK pixels (or values). Rows [P,3] are colors of a crop of CROP pixels' width, row by row. Sizes are
-constants of a compiled kernel: a run has one of each. All images and textures have at least 2 x 2 pixels.
+One program does BLOCK pixels (or values). Rows [P,C] are the P pixels of a crop, row by row, with C channels each; maps
+are those of `ViewMaps`, V views of H x W pixels. Tensors are contiguous, and a shape in brackets is followed by the
+stored type. Sizes are constants of a compiled kernel: a run has one of each. All images and textures have at least
+2 x 2 pixels.
 """
 
 from __future__ import annotations
@@ -59,7 +61,13 @@ def choose(
     FREE_X: tl.constexpr,
     FREE_Y: tl.constexpr,
 ):
-    """chosen [5] int64: source, auxiliary view, row of the pair, left and top of the crop."""
+    """One program draws a pair and a crop's corner, `PairSampler.choose`.
+
+    random: [4] float32, uniform in [0, 1). source_count: [1] int64, S. sources: [S] int64, views that can be drawn.
+    count: [V] int64, candidates of each. auxiliary: [V,COLUMNS] int64, these candidates.
+    chosen: [5] int64, written: source, auxiliary view, row of the pair, left and top of the crop.
+    FREE_X, FREE_Y: how many places the crop has in a view.
+    """
     source = tl.load(sources + pick(tl.load(random), tl.load(source_count)))
     pair = source * COLUMNS + pick(tl.load(random + 1), tl.load(count + source))
     tl.store(chosen, source)
@@ -73,7 +81,8 @@ def choose(
 def warped(color, depth, around, first, right, down, live, WIDTH: tl.constexpr, HEIGHT: tl.constexpr):
     """Bicubic color of a view at `corner`'s result, bilinear where one of the 16 pixels is background or missing.
 
-    around: `first` among the pixels of all views.
+    color: [V,H*W,3] uint8. depth: [V,H*W] float16, 0 = background. around: `first` among the pixels of all views.
+    Returns red, green and blue [BLOCK] float32 in [0,255].
     """
     column, row = first % WIDTH, first // WIDTH
     whole = live & (column > 0) & (column < WIDTH - 2) & (row > 0) & (row < HEIGHT - 2)
@@ -120,7 +129,17 @@ def draw(
     TEXTURE_HEIGHT: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Unprojects the source's depth, projects into the auxiliary view, tests visibility, and samples both."""
+    """Unprojects the source's depth, projects into the auxiliary view, tests visibility, and samples both.
+
+    chosen: [5] int64, of `choose`. relative: [3,4] float32, source camera to auxiliary camera.
+    color: [V,H*W,3] uint8. uv: [V,H*W,2] int16, `texture.encode_uv`. depth: [V,H*W] float16, metres along z,
+    0 = background. intrinsics: [V,4] float32, fx, fy, cx, cy in pixels.
+    slot_map: [TEXTURE_HEIGHT,TEXTURE_WIDTH] int32, rows of the compact texture, -1 = none.
+    Written, of the crop's PIXELS: condition and real [P,3] float32 in [-1,1], the source and the auxiliary view warped
+    into it; foreground and visible [P,1] float32, 0 or 1; slots [P,4] int32 and weights [P,4] float32, where the source
+    samples the texture, weight 0 for background.
+    tolerance: theta_z, metres. WIDTH, HEIGHT: of the views. CROP: the crop's width.
+    """
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = pixel < PIXELS
     source, auxiliary = tl.load(chosen), tl.load(chosen + 1)
@@ -178,7 +197,11 @@ def draw(
 
 @triton.jit
 def sample(values, slots, weights, rows, PIXELS: tl.constexpr, BLOCK: tl.constexpr):
-    """rows [P,3]: four texels of values [N,3] each, weighted."""
+    """Four weighted texels for each pixel, `texture.sample_texels`.
+
+    values: [N,3] float32, the compact texture. slots: [P,4] int32 or int64, its rows. weights: [P,4] float32.
+    rows: [P,3] float32, written.
+    """
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = pixel < PIXELS
     red = tl.zeros((BLOCK,), tl.float32)
@@ -196,7 +219,10 @@ def sample(values, slots, weights, rows, PIXELS: tl.constexpr, BLOCK: tl.constex
 
 @triton.jit
 def sample_backward(gradient, slots, weights, into, PIXELS: tl.constexpr, BLOCK: tl.constexpr):
-    """Adds the gradient [P,3] of `sample`'s rows to that of its values, `into` [N,3]; no weight, no cost."""
+    """Adds the gradient of `sample`'s rows to that of its values; no weight, no cost.
+
+    gradient: [P,3] float32. slots: [P,4] int32 or int64. weights: [P,4] float32. into: [N,3] float32, added to.
+    """
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = pixel < PIXELS
     for tap in tl.static_range(4):
@@ -209,7 +235,10 @@ def sample_backward(gradient, slots, weights, into, PIXELS: tl.constexpr, BLOCK:
 
 @triton.jit
 def moved_corner(offsets, x, y, WIDTH: tl.constexpr, HEIGHT: tl.constexpr, COLUMNS: tl.constexpr, ROWS: tl.constexpr):
-    """`corner` of the pixel that (x, y) is moved to, by offsets [ROWS,COLUMNS,2] interpolated between block centers."""
+    """`corner` of the place that pixel (x, y) is moved to.
+
+    offsets: [ROWS,COLUMNS,2] float32, x then y in pixels, interpolated between the blocks' centers.
+    """
     at_x = clamp((x + 0.5) / GRID - 1, COLUMNS - 1.0)
     at_y = clamp((y + 0.5) / GRID - 1, ROWS - 1.0)
     x0, y0 = tl.floor(at_x).to(tl.int32), tl.floor(at_y).to(tl.int32)
@@ -228,7 +257,7 @@ def moved_corner(offsets, x, y, WIDTH: tl.constexpr, HEIGHT: tl.constexpr, COLUM
 
 @triton.jit
 def bilinear(image, first, right, down, live, channel, CHANNELS: tl.constexpr, WIDTH: tl.constexpr):
-    """One channel of interleaved rows around `corner`'s result."""
+    """One channel [BLOCK] around `corner`'s result; image: rows [P,CHANNELS] float32."""
     nw = tl.load(image + first * CHANNELS + channel, mask=live, other=0.0)
     ne = tl.load(image + (first + 1) * CHANNELS + channel, mask=live, other=0.0)
     sw = tl.load(image + (first + WIDTH) * CHANNELS + channel, mask=live, other=0.0)
@@ -257,7 +286,14 @@ def assemble(
     ROWS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Both inputs [P,CHANNELS] of the discriminator: condition, residual of the moved example, zeros."""
+    """Both inputs of the discriminator: condition, residual of the moved example, zeros; `examples.assemble`.
+
+    condition, real, fake: [P,3] float32 in [-1,1]. visible: [P,1] float32, 0 or 1.
+    offsets: [2,ROWS,COLUMNS,2] float32, the real example's first, in pixels; not read unless MOVED.
+    fake_input, real_input: [P,CHANNELS] float32 or bfloat16, written.
+    moved_fake, moved_real: [P,3] float32, and moved_visible: [P,1] float32, written if MOVED.
+    WIDTH, HEIGHT: of the crop.
+    """
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = pixel < WIDTH * HEIGHT
     seen = tl.load(visible + pixel, mask=live, other=0.0)
@@ -313,7 +349,12 @@ def assemble_backward(
     ROWS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Gradient of the fake example, `into` [P,3] (zeros where MOVED), from those of its input and of it as moved."""
+    """Gradient of the fake example from those of its input and of it as moved.
+
+    of_input: [P,CHANNELS] float32 or bfloat16. of_moved: [P,3] float32; not read unless WITH_MOVED.
+    visible: [P,1] float32, as moved if MOVED. offsets: [ROWS,COLUMNS,2] float32, the fake example's; not read unless
+    MOVED. into: [P,3] float32, written, or added to if MOVED: then it holds zeros before.
+    """
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = pixel < WIDTH * HEIGHT
     seen = tl.load(visible + pixel, mask=live, other=0.0)
@@ -336,7 +377,10 @@ def assemble_backward(
 
 @triton.jit
 def average(mean, state, weight, COUNT: tl.constexpr, BLOCK: tl.constexpr):
-    """mean += weight * (state - mean); nine steps of ten have weight 0, and read nothing."""
+    """mean += weight * (state - mean); nine steps of ten have weight 0, and read nothing.
+
+    mean: [COUNT] float32, read and written. state: [COUNT] float32. weight: 0-dim float32.
+    """
     share = tl.load(weight)
     if share != 0:
         at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)

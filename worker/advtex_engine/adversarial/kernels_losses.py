@@ -1,4 +1,8 @@
-"""Triton kernels of the losses; `triton_losses.py` launches them and names each one's plain twin in torch."""
+"""Triton kernels of the losses; `triton_losses.py` launches them and names each one's plain twin in torch.
+
+Tensors are contiguous, and a shape in brackets is followed by the stored type; "any float" is float32 or bfloat16. Rows
+[P,C] are the P pixels of a crop, row by row. Logits are those of a crop's patches, COUNT in all.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,10 @@ def sigmoid(x):
 
 @triton.jit
 def patches(shares, at, live, COUNT: tl.constexpr):
-    """1 or 0: which patches count for the texture, and which for the discriminator. shares: [2,COUNT]."""
+    """1 or 0 float32 [BLOCK]: which patches count for the texture, and which for the discriminator.
+
+    shares: [2,COUNT] float32, of each patch how much is foreground, and how much is visible; `losses.example_shares`.
+    """
     inside = tl.load(shares + at, mask=live, other=0.0)
     seen = tl.load(shares + COUNT + at, mask=live, other=0.0)
     of_texture = live & (inside >= MIN_FOREGROUND)
@@ -42,7 +49,12 @@ def judge(
     COUNT: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Both players' losses over COUNT logits, whether the discriminator is ahead, and how many count for each [2]."""
+    """Both players' losses over all logits, in one program; `losses.judge`.
+
+    real, fake: [COUNT] any float, logits. shares: [2,COUNT] float32. pretraining: 0-dim float32, 1 or 0.
+    Written: of_discriminator, of_texture, 0-dim float32, the losses; ahead, 0-dim float32, 1 where the discriminator is
+    ahead; counts [2] float32, how many logits count for discriminator and texture, at least 1.
+    """
     lost, fooled, judged, drawn = (
         tl.zeros((BLOCK,), tl.float32),
         tl.zeros((BLOCK,), tl.float32),
@@ -83,7 +95,12 @@ def judge_backward(
     DRAWN: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Gradients of the logits. JUDGED, DRAWN: whether there is one of the discriminator's loss, of the texture's."""
+    """Gradients of the logits. JUDGED, DRAWN: whether there is one of the discriminator's loss, of the texture's.
+
+    real, fake: [COUNT] any float. shares: [2,COUNT] float32. counts: [2] float32, of `judge`.
+    of_discriminator, of_texture: 0-dim float32, the losses' gradients; not read unless JUDGED, or DRAWN.
+    into_real, into_fake: [COUNT] of the logits' type, written; into_real only if JUDGED.
+    """
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = at < COUNT
     texture, discriminator = patches(shares, at, live, COUNT)
@@ -101,7 +118,11 @@ def judge_backward(
 
 @triton.jit
 def l1(a, b, visible, sums, PARTS: tl.constexpr, PIXELS: tl.constexpr, BLOCK: tl.constexpr):
-    """sums [2,PARTS]: of |a - b| over each block's visible pixels of rows [P,3], and of these pixels."""
+    """Sums of |a - b| over each block's visible pixels, and of these pixels; `losses.l1_loss`.
+
+    a, b: [PIXELS,3] float32. visible: [PIXELS,1] float32, 0 or 1. sums: [2,PARTS] float32, a column for each program,
+    written.
+    """
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = pixel < PIXELS
     seen = tl.load(visible + pixel, mask=live, other=0.0)
@@ -115,7 +136,11 @@ def l1(a, b, visible, sums, PARTS: tl.constexpr, PIXELS: tl.constexpr, BLOCK: tl
 
 @triton.jit
 def l1_mean(sums, mean, count, PARTS: tl.constexpr, BLOCK: tl.constexpr):
-    """The quotient of the sums' totals, and how many numbers it is the mean of, at least 1."""
+    """The quotient of the sums' totals, in one program.
+
+    sums: [2,PARTS] float32, of `l1`. Written: mean, 0-dim float32; count, 0-dim float32, how many numbers it is the
+    mean of, at least 1.
+    """
     apart, seen = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
     for first in range(0, PARTS, BLOCK):
         part = first + tl.arange(0, BLOCK)
@@ -128,7 +153,11 @@ def l1_mean(sums, mean, count, PARTS: tl.constexpr, BLOCK: tl.constexpr):
 
 @triton.jit
 def l1_backward(a, b, visible, gradient, count, into, PIXELS: tl.constexpr, BLOCK: tl.constexpr):
-    """The mean's gradient times the sign of a - b where it is visible."""
+    """The mean's gradient times the sign of a - b where it is visible.
+
+    a, b: [PIXELS,3] float32. visible: [PIXELS,1] float32. gradient, count: 0-dim float32, the mean's gradient and
+    `l1_mean`'s count. into: [PIXELS,3] float32, the gradient of a, written.
+    """
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = pixel < PIXELS
     scale = tl.load(gradient) / tl.load(count) * tl.load(visible + pixel, mask=live, other=0.0)
@@ -140,7 +169,10 @@ def l1_backward(a, b, visible, gradient, count, into, PIXELS: tl.constexpr, BLOC
 
 @triton.jit
 def difference(a, b, sums, COUNT: tl.constexpr, BLOCK: tl.constexpr):
-    """Sum of |a - b| over each block, float32."""
+    """Sum of |a - b| over each block; `losses.mean_difference`.
+
+    a, b: [COUNT] any float. sums: [number of programs] float32, written.
+    """
     at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = at < COUNT
     value = tl.load(a + at, mask=live, other=0.0).to(tl.float32) - tl.load(b + at, mask=live, other=0.0).to(tl.float32)
@@ -149,7 +181,10 @@ def difference(a, b, sums, COUNT: tl.constexpr, BLOCK: tl.constexpr):
 
 @triton.jit
 def difference_mean(sums, mean, COUNT: tl.constexpr, PARTS: tl.constexpr, BLOCK: tl.constexpr):
-    """The sums' total over COUNT."""
+    """The sums' total over COUNT, in one program.
+
+    sums: [PARTS] float32, of `difference`. mean: 0-dim float32, written.
+    """
     total = tl.zeros((BLOCK,), tl.float32)
     for first in range(0, PARTS, BLOCK):
         part = first + tl.arange(0, BLOCK)
@@ -159,7 +194,10 @@ def difference_mean(sums, mean, COUNT: tl.constexpr, PARTS: tl.constexpr, BLOCK:
 
 @triton.jit
 def difference_backward(a, b, gradient, into, COUNT: tl.constexpr, BLOCK: tl.constexpr):
-    """The mean's gradient times the sign of a - b."""
+    """The mean's gradient times the sign of a - b.
+
+    a, b: [COUNT] any float. gradient: 0-dim float32, the mean's. into: [COUNT] of a's type, the gradient of a, written.
+    """
     at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = at < COUNT
     value = tl.load(a + at, mask=live, other=0.0).to(tl.float32) - tl.load(b + at, mask=live, other=0.0).to(tl.float32)

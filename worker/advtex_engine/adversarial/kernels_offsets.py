@@ -1,6 +1,7 @@
 """Triton kernels of the examples' alignment; `triton_offsets.py` launches them.
 
-One program does BLOCK values, or one block of SIDE x SIDE pixels; such blocks lie SIDE / 2 apart.
+One program does BLOCK values, or one block of SIDE x SIDE pixels; such blocks lie SIDE / 2 apart. Tensors are
+contiguous, and a shape in brackets is followed by the stored type. Rows are the pixels of a crop, row by row.
 """
 
 from __future__ import annotations
@@ -11,7 +12,11 @@ import triton.language as tl
 
 @triton.jit
 def luminance(condition, real, fake, visible, planes, PIXELS: tl.constexpr, BLOCK: tl.constexpr):
-    """planes [3,P]: of the images' rows [P,3], 0 where nothing is visible."""
+    """Luminance of three images, 0 where nothing is visible.
+
+    condition, real, fake: [PIXELS,3] float32 in [-1,1]. visible: [PIXELS] float32, 0 or 1.
+    planes: [3,PIXELS] float32, in this order, written.
+    """
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = pixel < PIXELS
     seen = tl.load(visible + pixel, mask=live, other=0.0)
@@ -37,7 +42,12 @@ def cut_blocks(
     ROWS: tl.constexpr,
     SIDE: tl.constexpr,
 ):
-    """blocks [3,ROWS,COLUMNS,SIDE,SIDE]: planes without what is smooth, where visible, fading out to the border."""
+    """A program's block of one plane, without what is smooth, where visible, fading out to the border.
+
+    planes: [3,HEIGHT,WIDTH] float32, of `luminance`. smooth: the same shape, its means over boxes.
+    visible: [HEIGHT,WIDTH] float32, 0 or 1. window: [SIDE,SIDE] float32, 1 amid a block and 0 at its border.
+    blocks: [3,ROWS,COLUMNS,SIDE,SIDE] float32, written.
+    """
     number = tl.program_id(0)
     image, block = number // (ROWS * COLUMNS), number % (ROWS * COLUMNS)
     place = tl.arange(0, SIDE * SIDE)
@@ -51,7 +61,11 @@ def cut_blocks(
 
 @triton.jit
 def whiten(spectrum, cross, strength, COUNT: tl.constexpr, VALUES: tl.constexpr, BLOCK: tl.constexpr):
-    """From the spectra [3,COUNT,2] of reference and examples: strength |e r*| [2,COUNT], and e r* over its root."""
+    """The cross spectrum e r* of each example e and the reference r, over the root of its strength.
+
+    spectrum: [3,COUNT,2] float32, real and imaginary part, of reference, real and fake example.
+    Written: cross [2,COUNT,2] float32; strength [2,COUNT] float32, |e r*|. VALUES: 2 COUNT.
+    """
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = at < VALUES
     reference, example = spectrum + (at % COUNT) * 2, spectrum + (COUNT + at) * 2
@@ -80,7 +94,14 @@ def find_peaks(
     ROWS: tl.constexpr,
     SIDE: tl.constexpr,
 ):
-    """offsets [2,ROWS,COLUMNS,2]: where each block's correlation is highest, if that is to be believed, else 0."""
+    """Where a program's block has its highest correlation, if that is to be believed, else 0.
+
+    correlation: [2,ROWS,COLUMNS,SIDE,SIDE] float32, of real and fake example, at offset (0, 0) first.
+    strength: [2,ROWS,COLUMNS,SIDE,SIDE/2+1] float32, of `whiten`. visible: [HEIGHT,WIDTH] float32, 0 or 1.
+    offsets: [2,ROWS,COLUMNS,2] float32, x then y in pixels, written.
+    BOUND: the largest offset that is believed, pixels. MIN_SEEN: share of the block that is visible. MIN_CORRELATION:
+    of what equal spectra give. MIN_GAIN: over the correlation at no offset.
+    """
     number = tl.program_id(0)
     block = number % (ROWS * COLUMNS)
     place = tl.arange(0, SIDE * SIDE)

@@ -42,7 +42,9 @@ from advtex_store import keys
 from advtex_store.accounts import check_active_jobs
 from advtex_store.database import Database
 from advtex_store.errors import IllegalTransition, RecordNotFound, StaleAttempt
-from advtex_store.models import EventRow, JobRow
+from advtex_store.fair_queue import WaitingJob, distinct_pairs, next_jobs, use_order_of_index
+from advtex_store.models import KEPT, WAITS_FOR_A_REASON, EventRow, JobRow
+from advtex_store.needs import GIB
 from advtex_store.tallies import ATTEMPTS, tally, tally_end
 from advtex_store.troubles import ADOPT, not_aside
 from advtex_store.webhooks import tell_webhooks
@@ -61,6 +63,7 @@ TRANSITIONS: Mapping[JobState, frozenset[JobState]] = {
 }
 WAITING = frozenset({S.queued, S.preempted})
 POISON_DEATHS = 3
+EXPLAINED = 1000  # waiting rows that are told at a time why they wait
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,44 +227,39 @@ class Records:
 
     # -- dispatcher and reconciler --------------------------------------------------------------------------------
 
-    def waiting(self, limit: int, memory_bytes: int | None = None) -> list[JobRow]:
-        """Jobs to run next, of those that need no more than `memory_bytes`.
-
-        Preempted ones first. Then owners take turns, those first who have the fewest jobs running; among the jobs of
-        one owner the larger priority comes first, then the older job.
-        """
-        waits: list[ColumnElement[bool]] = [JobRow.state.in_(WAITING), JobRow.deleted_at.is_(None)]
-        if memory_bytes is not None:
-            waits.append(JobRow.memory_bytes <= memory_bytes)
-        running = select(JobRow.owner, func.count().label("jobs")).where(JobRow.state == S.running)
-        held = running.group_by(JobRow.owner).subquery()
-        place = func.row_number().over(
-            partition_by=JobRow.owner, order_by=(JobRow.state != S.preempted, JobRow.priority.desc(), JobRow.id)
-        )
-        turn = (place + func.coalesce(held.c.jobs, 0)).label("turn")
-        order = select(JobRow.id, turn).outerjoin(held, held.c.owner == JobRow.owner).where(*waits).subquery()
-        query = select(JobRow).join(order, order.c.id == JobRow.id)
-        query = query.order_by(JobRow.state != S.preempted, order.c.turn, JobRow.id).limit(limit)
+    def waiting(self, limit: int, memory_bytes: int | None = None) -> list[WaitingJob]:
+        """Jobs to run next, of those that fit a worker of so much memory, as `fair_queue` orders them."""
         with self.database.read() as session:
-            return list(session.scalars(query))
+            return next_jobs(session, limit, None if memory_bytes is None else memory_bytes // GIB)
+
+    def any_preempted(self) -> bool:
+        """Whether a job waits that had to give its worker back."""
+        with self.database.read() as session:
+            return session.scalar(select(JobRow.id).where(JobRow.state == S.preempted, KEPT).limit(1)) is not None
 
     def explain(self, reason: str, *, above: int = -1, up_to: int | None = None) -> None:
-        """Tell why jobs wait that need more than `above` and no more than `up_to` bytes of memory."""
-        where: list[ColumnElement[bool]] = [
-            JobRow.state.in_(WAITING),
-            JobRow.deleted_at.is_(None),
-            JobRow.memory_bytes > above,
-            JobRow.waiting_reason != reason,
-        ]
+        """Tell why jobs wait that need more than `above` and no more than `up_to` bytes of memory (whole GiB).
+
+        A few thousand rows at a time at most: where more wait, those that are left are told the next time.
+        """
+        pairs = distinct_pairs(WAITS_FOR_A_REASON, JobRow.memory_gib, JobRow.waiting_reason)
+        wrong = select(pairs.c.first, pairs.c.second).where(pairs.c.first > above // GIB, pairs.c.second != reason)
         if up_to is not None:
-            where.append(JobRow.memory_bytes <= up_to)
+            wrong = wrong.where(pairs.c.first <= up_to // GIB)
         with self.database.read() as session:
-            if session.scalar(select(JobRow.id).where(*where).limit(1)) is None:
-                return
-        with self.database.write() as session:
-            now = self.database.now(session)
-            values = {"waiting_reason": reason, "version": JobRow.version + 1, "updated_at": now}
-            session.execute(update(JobRow).where(*where).values(**values))
+            use_order_of_index(session)
+            found = session.execute(wrong).all()
+        for gib, told in found:
+            where = and_(WAITS_FOR_A_REASON, JobRow.memory_gib == gib, JobRow.waiting_reason == told)
+            with self.database.write() as session:
+                now = self.database.now(session)
+                # Another server tells them at the same time: what it has locked is left to it.
+                some = select(JobRow.id).where(where).limit(EXPLAINED).with_for_update(skip_locked=True)
+                values = {"waiting_reason": reason, "version": JobRow.version + 1, "updated_at": now}
+                session.execute(
+                    update(JobRow).where(JobRow.id.in_(some), where).values(**values),
+                    execution_options={"synchronize_session": False},
+                )
 
     def expired(self, limit: int = 100) -> list[tuple[str, int]]:
         """(job, attempt) whose lease has run out, of jobs that were not set aside."""

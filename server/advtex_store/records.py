@@ -255,18 +255,16 @@ class Records:
                 now = self.database.now(session)
                 # Another server tells them at the same time: what it has locked is left to it.
                 some = select(JobRow.id).where(where).limit(EXPLAINED).with_for_update(skip_locked=True)
+                ids = session.scalars(some).all()
                 values = {"waiting_reason": reason, "version": JobRow.version + 1, "updated_at": now}
-                session.execute(
-                    update(JobRow).where(JobRow.id.in_(some), where).values(**values),
-                    execution_options={"synchronize_session": False},
-                )
+                session.execute(update(JobRow).where(JobRow.id.in_(ids)).values(**values))
 
     def expired(self, limit: int = 100) -> list[tuple[str, int]]:
         """(job, attempt) whose lease has run out, of jobs that were not set aside."""
         with self.database.read() as session:
             now = self.database.now(session)
-            query = select(JobRow.id, JobRow.attempt).where(JobRow.state == S.running, JobRow.lease_expires_at < now)
-            query = query.where(not_aside(ADOPT, JobRow.id, now))
+            query = select(JobRow.id, JobRow.attempt).where(JobRow.state == S.running, KEPT)
+            query = query.where(JobRow.lease_expires_at < now, not_aside(ADOPT, JobRow.id, now))
             return [(job_id, attempt) for job_id, attempt in session.execute(query.limit(limit))]
 
     def count_by_state(self) -> dict[str, int]:

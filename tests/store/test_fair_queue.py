@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -17,7 +18,7 @@ from advtex_contract.options import JobOptions
 from advtex_store.ids import new_id
 from advtex_store.models import JobRow
 from advtex_store.needs import GIB
-from advtex_store.records import WAITING
+from advtex_store.records import EXPLAINED, WAITING
 
 STATES = (JobState.queued, JobState.queued, JobState.preempted, JobState.running, JobState.succeeded)
 Job = tuple[str, JobState, int, int, bool]
@@ -111,3 +112,34 @@ def test_a_look_costs_what_it_finds_and_not_what_waits(bench: Any) -> None:
 
     few, many = seconds(200), seconds(10_000)
     assert many < 4 * few, f"{1e3 * few:.1f} ms with 200 waiting jobs, {1e3 * many:.1f} ms with 10,000"
+
+
+def test_servers_that_tell_why_jobs_wait_at_once_tell_each_job_once(bench: Any) -> None:
+    """And a great many of them in several goes, so that no transaction is long."""
+    jobs: list[Job] = [("a", JobState.queued, 0, (n % 2) * 20 * GIB, False) for n in range(2 * EXPLAINED + 500)]
+    fill(bench, bench.finished_upload(), jobs)
+
+    def told() -> dict[str, int]:
+        with bench.database.read() as session:
+            query = select(JobRow.waiting_reason, JobRow.version, func.count()).group_by("waiting_reason", "version")
+            return {f"{reason} {version}": count for reason, version, count in session.execute(query)}
+
+    def tell(reason: str) -> None:
+        bench.records.explain(reason, above=8 * GIB)
+
+    def tell_at_once(reason: str) -> None:
+        threads = [threading.Thread(target=tell, args=(reason,)) for _ in range(3)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+
+    small, large = EXPLAINED + 250, EXPLAINED + 250
+    tell("too large")
+    assert told() == {" 1": small + 250, "too large 2": EXPLAINED}
+    tell_at_once("too large")
+    tell("too large")
+    assert told() == {" 1": small, "too large 2": large}
+    tell_at_once("")
+    tell("")
+    assert told() == {" 1": small, " 3": large}

@@ -16,6 +16,8 @@ from datetime import UTC, datetime
 from typing import Any
 
 from redis import Redis
+from redis.backoff import NoBackoff
+from redis.retry import Retry
 from rq import Queue
 from rq.exceptions import DuplicateJobError, NoSuchJobError
 from rq.job import Job
@@ -68,11 +70,18 @@ def queue_name(gib: int) -> str:
 
 def connect_redis(settings: StoreSettings) -> Redis:
     """A client that gives up after seconds when Redis is away; RQ's workers raise the limit for their own waits."""
-    password = settings.redis_password()
-    extra = {} if password is None else {"password": password}
-    return Redis.from_url(
-        settings.redis_url, socket_connect_timeout=3, socket_timeout=10, health_check_interval=30, **extra
-    )
+    return _connect(settings, socket_connect_timeout=3, socket_timeout=10, health_check_interval=30)
+
+
+def connect_redis_briefly(settings: StoreSettings) -> Redis:
+    """A client for what is nice to have: it asks once, and gives up after a moment."""
+    return _connect(settings, socket_connect_timeout=0.5, socket_timeout=0.5, retry=Retry(NoBackoff(), 0))
+
+
+def _connect(settings: StoreSettings, **options: Any) -> Redis:
+    if (password := settings.redis_password()) is not None:
+        options["password"] = password
+    return Redis.from_url(settings.redis_url, **options)
 
 
 class JobQueue:

@@ -7,10 +7,11 @@ How a worker carries a job (`store = open_store(settings)`; RQ calls `advtex_wor
 2. `if store.results.adopt(job_id): return`: an earlier attempt had already finished, only its row was not told.
 3. Fetch the scan: `store.blobs.fetch(claim.scan_key, path)`. Resume: every blob below
    `keys.checkpoints_prefix(job_id)`, attempts in ascending order, laid over one another (`keys.py`).
-4. Every second or two, and from a thread that does not wait for the engine:
-   `lease = store.records.heartbeat(job_id, attempt, progress=…, reached=…)`. `lease.cancel_requested` -> stop the
-   engine with a checkpoint. `StaleAttempt` -> the lease is lost: stop at once, upload nothing more. A heartbeat that
-   fails because the database is away is no loss: try again until `lease_seconds` have passed since the last good one.
+4. Every half second, and from a thread that does not wait for the engine: `store.live_progress.tell(…)` for those who
+   watch, and `lease = store.records.lease(job_id, attempt)`, which writes nothing; every few seconds instead of that
+   `store.records.heartbeat(job_id, attempt, progress=…, reached=…)`. `lease.cancel_requested` -> stop the engine with a
+   checkpoint. `StaleAttempt` -> the lease is lost: stop at once, upload nothing more. A heartbeat that fails because
+   the database is away is no loss: try again until `lease_seconds` have passed since the last good one.
 5. New checkpoint files: `store.blobs.upload(path, keys.checkpoint_prefix(job_id, attempt) + name)`.
 6. The end, one of
    - `store.results.commit(job_id, attempt, {name: path}, warnings)`: uploads the files, writes the manifest once,
@@ -124,12 +125,22 @@ class Records:
                 lease=Lease(expires_at, row.cancel_requested),
             )
 
+    def lease(self, job_id: str, attempt: int) -> Lease:
+        """The lease as it is, without a commit. StaleAttempt: it is lost."""
+        with self.database.read() as session:
+            query = select(JobRow.lease_expires_at, JobRow.cancel_requested).where(_held(job_id, attempt))
+            found = session.execute(query).one_or_none()
+            if found is None:
+                raise StaleAttempt(self._why_stale(session, job_id, attempt))
+            return Lease(found.lease_expires_at or 0.0, found.cancel_requested)
+
     def heartbeat(
         self,
         job_id: str,
         attempt: int,
         progress: Progress | None = None,
         *,
+        stages: Sequence[Progress] = (),
         reached: int = 0,
         lease_seconds: float | None = None,
         log_tail: str | None = None,
@@ -137,6 +148,7 @@ class Records:
     ) -> Lease:
         """Keep the lease and tell how far the attempt is. StaleAttempt: the lease is lost.
 
+        stages: how each stage began that did so since the last heartbeat.
         reached: any number that grows with the work and means the same in every attempt (say, stage index times
         10^7 plus step). Deaths count towards poison only while no attempt gets farther than the ones before.
         log_tail: the newest lines of the engine's log, shown if the job has to be given up.
@@ -151,8 +163,10 @@ class Records:
                 row.log_tail = log_tail
             if waiting_reason is not None and (reason := waiting_reason[:255]) != row.waiting_reason:
                 row.waiting_reason, row.updated_at, row.version = reason, now, row.version + 1
-            if progress is not None and (data := progress.model_dump(mode="json")) != row.progress:
-                stage_changed = progress.stage != row.progress.get("stage")
+            for told in stages if progress is None else (*stages, progress):
+                if (data := told.model_dump(mode="json")) == row.progress:
+                    continue
+                stage_changed = told.stage != row.progress.get("stage")
                 row.progress, row.updated_at, row.version = data, now, row.version + 1
                 if stage_changed:
                     _record(session, row, "progress", {name: data[name] for name in data if name != "notes"})

@@ -242,7 +242,7 @@ class Simulation:
         return watch.seconds
 
     def churn(self, seconds: float) -> list[float]:
-        """Jobs end and workers take the next ones, while a dispatcher does its rounds. -> seconds that each had none."""
+        """Jobs end and workers take the next ones, while a dispatcher does its rounds. -> seconds of each with none."""
         assert isinstance(self.store.settings, ServerSettings)
         dispatcher = Dispatcher(self.store, self.store.settings)
         rounds = threading.Thread(target=lambda: asyncio.run(self._dispatch(dispatcher)))

@@ -56,6 +56,7 @@ from postgres import postgres
 
 CLASSES = (8, 16, 24)  # GiB
 OWNERS = 50
+LEASE_SECONDS = 3600.0  # attempts are begun long before their heartbeats are
 THREADS = 12
 BEATING_PROCESSES = 2
 TURN_SECONDS = 0.5  # a worker's default
@@ -123,7 +124,10 @@ def opened(fleet: Fleet, server: str | None) -> Iterator[Store]:
                 connection.execute(f"create database {name}")
             database = server + name
         settings = ServerSettings(
-            data_dir=folder / "data", database_url=database, redis_url=f"redis://127.0.0.1:{port}/0"
+            data_dir=folder / "data",
+            database_url=database,
+            redis_url=f"redis://127.0.0.1:{port}/0",
+            lease_seconds=LEASE_SECONDS,
         )
         upgrade_database(settings.database)
         store = open_store(settings)
@@ -297,7 +301,9 @@ def measure_waiting(store: Store, fleet: Fleet) -> dict[str, float]:
 
 def measure_heartbeats(store: Store, held: Sequence[tuple[str, int]], seconds: float) -> dict[str, float]:
     """Of all running jobs, by processes of their own."""
-    settings = store.settings.model_dump(mode="json", include={"data_dir", "database_url", "redis_url"})
+    settings = store.settings.model_dump(
+        mode="json", include={"data_dir", "database_url", "redis_url", "lease_seconds"}
+    )
     command = [sys.executable, __file__, "--beat"]
     processes = []
     for number in range(BEATING_PROCESSES):

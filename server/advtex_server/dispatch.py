@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 
 import structlog
@@ -19,8 +19,8 @@ from starlette.concurrency import run_in_threadpool
 from advtex_contract.jobs import JobState
 from advtex_server.settings import ServerSettings
 from advtex_store.errors import StaleAttempt, StoreError
-from advtex_store.models import JobRow
-from advtex_store.queue import WorkerClass
+from advtex_store.fair_queue import WaitingJob
+from advtex_store.queue import WorkerClass, rq_id
 from advtex_store.retention import Retention
 from advtex_store.store import Store
 from advtex_store.troubles import ADOPT
@@ -35,6 +35,30 @@ TOO_LARGE = (
 )
 
 log = structlog.get_logger("advtex.dispatch")
+
+
+class Held:
+    """The attempts that wait in Redis, by class of workers, as one round has found them and changed them."""
+
+    def __init__(self, by_class: Mapping[int, Iterable[str]]) -> None:
+        self._by_class = {gib: set(names) for gib, names in by_class.items()}
+
+    def __contains__(self, name: str) -> bool:
+        return any(name in names for names in self._by_class.values())
+
+    @property
+    def total(self) -> int:
+        return sum(map(len, self._by_class.values()))
+
+    def waiting(self, found: WorkerClass) -> int:
+        """How many wait for a class."""
+        return len(self._by_class[found.gib])
+
+    def add(self, to: WorkerClass, name: str) -> None:
+        self._by_class[to.gib].add(name)
+
+    def remove(self, of: WorkerClass, names: Iterable[str]) -> None:
+        self._by_class[of.gib].difference_update(names)
 
 
 class Dispatcher:
@@ -92,50 +116,54 @@ class Dispatcher:
         try:
             classes = queue.classes()
             queue.withdraw({found.gib for found in classes})
-            waiting = {found.gib: len(queue.waiting_ids(found.gib)) for found in classes}
-            before = sum(waiting.values())
-            self._take_back(classes, waiting)
+            held = Held(queue.waiting_by_class([found.gib for found in classes]))
+            before = held.total
+            self._take_back(classes, held)
             for found in classes:
-                waiting[found.gib] += self._offer(found, found.idle - waiting[found.gib], sum(waiting.values()))
+                self._offer(found, found.idle - held.waiting(found), held)
             for found in classes:
-                room = found.workers * self.settings.queue_depth - waiting[found.gib]
-                waiting[found.gib] += self._offer(found, room, sum(waiting.values()))
-            for found in classes:
-                waiting[found.gib] += self._offer_preempted(found, sum(waiting.values()))
+                self._offer(found, found.workers * self.settings.queue_depth - held.waiting(found), held)
+            if self.store.records.any_preempted():
+                for found in classes:
+                    self._offer_preempted(found, held)
         except RedisError:
             self.store.records.explain(REDIS_AWAY)
             raise
         self._explain(classes)
-        return sum(waiting.values()) - before
+        return held.total - before
 
-    def _take_back(self, classes: Sequence[WorkerClass], waiting: dict[int, int]) -> None:
+    def _take_back(self, classes: Sequence[WorkerClass], held: Held) -> None:
         """What waits behind busy workers while larger ones are idle, which are offered it next."""
         for place, found in enumerate(classes):
-            free = sum(max(0, larger.idle - waiting[larger.gib]) for larger in classes[place + 1 :])
-            behind = min(waiting[found.gib] - found.idle, free)
+            free = sum(max(0, larger.idle - held.waiting(larger)) for larger in classes[place + 1 :])
+            behind = min(held.waiting(found) - found.idle, free)
             if behind > 0:
-                waiting[found.gib] -= self.store.queue.take_back(found.gib, behind)
+                held.remove(found, self.store.queue.take_back(found.gib, behind))
 
-    def _offer(self, to: WorkerClass, room: int, in_redis: int) -> int:
-        """The next attempts to one class, as far as there is room. -> how many were new."""
-        offered = 0
+    def _offer(self, to: WorkerClass, room: int, held: Held) -> None:
+        """The next attempts to one class, as far as there is room."""
         if room <= 0:
-            return 0
-        for row in self.store.records.waiting(room + in_redis, to.memory_bytes):
-            if offered == room:
-                break
-            offered += self._offer_row(row, to)
-        return offered
+            return
+        for job in self.store.records.waiting(room + held.total, to.memory_bytes):
+            room -= self._offer_job(job, to, held)
+            if room == 0:
+                return
 
-    def _offer_preempted(self, to: WorkerClass, in_redis: int) -> int:
-        """What had to give its worker back is not kept waiting for room. -> how many were new."""
-        rows = self.store.records.waiting(1 + in_redis, to.memory_bytes)
-        return sum(self._offer_row(row, to) for row in rows if row.state == JobState.preempted)
+    def _offer_preempted(self, to: WorkerClass, held: Held) -> None:
+        """What had to give its worker back is not kept waiting for room."""
+        for job in self.store.records.waiting(1 + held.total, to.memory_bytes):
+            if job.state == JobState.preempted:
+                self._offer_job(job, to, held)
 
-    def _offer_row(self, row: JobRow, to: WorkerClass) -> bool:
-        if not self.store.queue.offer(row.id, row.attempt, to.gib, front=row.state == JobState.preempted):
+    def _offer_job(self, job: WaitingJob, to: WorkerClass, held: Held) -> bool:
+        """-> whether it was new to Redis."""
+        name = rq_id(job.id, job.attempt)
+        if name in held or not self.store.queue.offer(
+            job.id, job.attempt, to.gib, front=job.state == JobState.preempted
+        ):
             return False
-        log.info("enqueued", job=row.id, attempt=row.attempt, worker_gib=to.gib)
+        held.add(to, name)
+        log.info("enqueued", job=job.id, attempt=job.attempt, worker_gib=to.gib)
         return True
 
     def _explain(self, classes: Sequence[WorkerClass]) -> None:

@@ -1,4 +1,7 @@
-"""Server-sent events of one job, read from its row: any server can serve them, and a restart loses none."""
+"""Server-sent events of one job, read from its row: any server can serve them, and a restart loses none.
+
+Between two changes of the row its progress moves on, as the attempt tells it through Redis.
+"""
 
 from __future__ import annotations
 
@@ -24,19 +27,19 @@ class _Look:
     """A job as it was read once: its row, the `job` message about it, and its events after some versions."""
 
     def __init__(self, service: Service, owner: str, job_id: str) -> None:
-        self._records, self._owner, self._job_id = service.store.records, owner, job_id
+        self._service, self._owner, self._job_id = service, owner, job_id
         self._events: dict[int, asyncio.Future[list[EventRow]]] = {}
         self.at = time.monotonic()
         self.job = asyncio.ensure_future(run_in_threadpool(self._read))
 
     def _read(self) -> tuple[JobRow, str]:
-        row = self._records.job(self._job_id, self._owner)
+        row = self._service.newest(self._owner, self._job_id)
         return row, _message("job", row.version, job_view(row).model_dump_json())
 
     def events(self, after: int) -> asyncio.Future[list[EventRow]]:
         """Recorded after this version."""
         if after not in self._events:
-            read = run_in_threadpool(self._records.events, self._job_id, after)
+            read = run_in_threadpool(self._service.store.records.events, self._job_id, after)
             self._events[after] = asyncio.ensure_future(read)
         return self._events[after]
 
@@ -62,7 +65,7 @@ async def stream_events(
 ) -> AsyncIterator[str]:
     """Changes after version `after`, then new ones until the job has ended, was deleted, or the server stops."""
     seen, spoken = after, time.monotonic()
-    first = True
+    said = ""
     while not stopping.is_set():
         look = lookout.look(owner, job_id)
         try:
@@ -73,10 +76,10 @@ async def stream_events(
         except SQLAlchemyError:  # also when all connections are in use
             await _pause(stopping)
             continue
-        if first or row.version > seen:
+        if message != said:
             yield "".join(_message(e.data["kind"], e.version, json.dumps(e.data)) for e in _until(recorded, row))
             yield message
-            seen, spoken, first = max(seen, row.version), time.monotonic(), False
+            seen, said, spoken = max(seen, row.version), message, time.monotonic()
         if JobState(row.state) in TERMINAL:
             return
         if time.monotonic() - spoken > PING_SECONDS:

@@ -13,6 +13,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from advtex_contract.jobs import JobState
+from advtex_store.records import WAITING
 from advtex_store.store import Store
 from advtex_store.tallies import ATTEMPTS, FAILURES, JOBS, STAGES
 
@@ -55,7 +56,7 @@ class FleetCollector(Collector):
             jobs.add_metric([state.value], counts.get(state.value, 0))
         yield jobs
         load = self.store.tallies.load()
-        yield GaugeMetricFamily("advtex_queue_depth", "Jobs that wait", load.waiting)
+        yield GaugeMetricFamily("advtex_queue_depth", "Jobs that wait", sum(counts.get(state, 0) for state in WAITING))
         yield GaugeMetricFamily("advtex_queue_age_seconds", "Age of the oldest job that waits", load.oldest_seconds)
         yield GaugeMetricFamily("advtex_steps_per_second", "Of all running jobs together", load.steps_per_second)
         yield GaugeMetricFamily("advtex_webhook_deliveries", "Deliveries that wait", load.deliveries)

@@ -104,10 +104,17 @@ class Service:
         return job_view(row), True
 
     def job(self, owner: str, job_id: str) -> JobView:
-        return job_view(self.store.records.job(job_id, owner))
+        return job_view(self.newest(owner, job_id))
+
+    def newest(self, owner: str, job_id: str) -> JobRow:
+        """The row with the progress of this moment."""
+        row = self.store.records.job(job_id, owner)
+        self.store.live_progress.show([row])
+        return row
 
     def jobs(self, owner: str, wanted: JobFilter, cursor: str | None, limit: int) -> JobPage:
         rows, following = self.store.submissions.list_jobs(owner, wanted, cursor=cursor, limit=limit)
+        self.store.live_progress.show(rows)
         return JobPage(jobs=[job_view(row) for row in rows], next_cursor=following)
 
     def cancel(self, owner: str, job_id: str) -> JobView:

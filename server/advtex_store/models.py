@@ -4,10 +4,35 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import JSON, BigInteger, Double, ForeignKey, Index, String, Text
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    ColumnElement,
+    Computed,
+    Double,
+    ForeignKey,
+    Index,
+    String,
+    Text,
+    TextClause,
+    text,
+)
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, validates
 
 LOG_TAIL = 8000  # characters of a log that its row keeps
+
+# Conditions of partial indexes. A query uses such an index only if it says the same in the same words, and the planners
+# know little of how many rows that are: two indexes of waiting rows have words of their own, so that each query has one
+# that it can use, and no index on `state` alone serves either.
+WAITS_IN_LINE = text("state || '' in ('preempted', 'queued') and deleted_at is null")
+WAITS_FOR_A_REASON = text("'' || state in ('preempted', 'queued') and deleted_at is null")
+KEPT = text("deleted_at is null")
+UNTIDY = text("state = 'succeeded' and tidied_at is null and deleted_at is null")
+UNPURGED = text("deleted_at is not null and purged_at is null")
+
+
+def _partial(name: str, *columns: str | ColumnElement[Any], where: TextClause) -> Index:
+    return Index(name, *columns, postgresql_where=where, sqlite_where=where)
 
 
 class Base(DeclarativeBase):
@@ -67,9 +92,14 @@ class UploadRow(Base):
     tus_metadata: Mapped[str] = mapped_column(Text, default="")
     source: Mapped[str | None] = mapped_column(Text)
     created_at: Mapped[float]
-    expires_at: Mapped[float | None] = mapped_column(index=True)
+    expires_at: Mapped[float | None]
     deleted_at: Mapped[float | None]
     purged_at: Mapped[float | None]
+
+    __table_args__ = (
+        _partial("ix_uploads_expires_at", "expires_at", where=KEPT),
+        _partial("ix_uploads_unpurged", "id", where=UNPURGED),
+    )
 
 
 class JobRow(Base):
@@ -81,8 +111,8 @@ class JobRow(Base):
     reached, reached_at_claim, deaths: how far any attempt got, where this one began, and how many attempts in a row
     died without getting farther.
     source: the URL of a scan that stays where it is; its upload row is a mere placeholder.
-    memory_bytes: what a worker must have (`needs.py`). waiting_reason: for people, the
-    dispatcher's while the job waits and the worker's while it pauses.
+    memory_bytes: what a worker must have (`needs.py`). memory_gib: the same as the class of the smallest such worker.
+    waiting_reason: for people, the dispatcher's while the job waits and the worker's while it pauses.
     tidied_at: when what no result needs was removed.
     """
 
@@ -98,6 +128,7 @@ class JobRow(Base):
     options: Mapped[dict[str, Any]]
     priority: Mapped[int] = mapped_column(default=0)
     memory_bytes: Mapped[int] = mapped_column(BigInteger, default=0)
+    memory_gib: Mapped[int] = mapped_column(BigInteger, Computed("(memory_bytes + 1073741823) / 1073741824"))
     waiting_reason: Mapped[str] = mapped_column(default="")
     attempt: Mapped[int] = mapped_column(default=1)
     worker: Mapped[str | None]
@@ -124,8 +155,13 @@ class JobRow(Base):
     __table_args__ = (
         Index("ix_jobs_owner_id", "owner", "id"),
         Index("ix_jobs_owner_updated_at", "owner", "updated_at"),
-        Index("ix_jobs_state_id", "state", "id"),
         Index("ix_jobs_owner_batch_id", "owner", "batch", "id"),
+        _partial("ix_jobs_state_id", "state", "id", where=KEPT),
+        _partial("ix_jobs_line", "owner", "memory_gib", "state", priority.desc(), "id", where=WAITS_IN_LINE),
+        _partial("ix_jobs_reason", "memory_gib", "waiting_reason", where=WAITS_FOR_A_REASON),
+        _partial("ix_jobs_expires_at", "expires_at", where=KEPT),
+        _partial("ix_jobs_untidy", "finished_at", where=UNTIDY),
+        _partial("ix_jobs_unpurged", "id", where=UNPURGED),
     )
 
     @validates("log_tail")

@@ -9,12 +9,15 @@ Redis: attempts, leases and limits live in the rows.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
 from redis import Redis
+from redis.backoff import NoBackoff
+from redis.retry import Retry
 from rq import Queue
 from rq.exceptions import DuplicateJobError, NoSuchJobError
 from rq.job import Job
@@ -28,6 +31,7 @@ TASK = "advtex_worker.tasks.run_job"
 STARTED_GRACE_SECONDS = 10.0  # between taking an id and claiming the row; later the taker is held for dead
 PRESENCE = "advtex:worker:"
 BUSY = " busy"
+SCANNED = 10_000  # keys that Redis looks at in one go, a few milliseconds; there are some per worker
 PRESENCE_SECONDS = 20  # a worker that has not announced itself for so long is gone
 
 
@@ -49,10 +53,15 @@ def class_of(memory_bytes: int) -> int:
     return memory_bytes // GIB
 
 
-def attempt_of(rq_id: str) -> tuple[str, int]:
+def attempt_of(name: str) -> tuple[str, int]:
     """(job, attempt) of what a worker has taken."""
-    job_id, _, attempt = rq_id.rpartition("-")
+    job_id, _, attempt = name.rpartition("-")
     return job_id, int(attempt)
+
+
+def rq_id(job_id: str, attempt: int) -> str:
+    """What Redis calls the attempt."""
+    return f"{job_id}-{attempt}"
 
 
 def queue_name(gib: int) -> str:
@@ -61,11 +70,18 @@ def queue_name(gib: int) -> str:
 
 def connect_redis(settings: StoreSettings) -> Redis:
     """A client that gives up after seconds when Redis is away; RQ's workers raise the limit for their own waits."""
-    password = settings.redis_password()
-    extra = {} if password is None else {"password": password}
-    return Redis.from_url(
-        settings.redis_url, socket_connect_timeout=3, socket_timeout=10, health_check_interval=30, **extra
-    )
+    return _connect(settings, socket_connect_timeout=3, socket_timeout=10, health_check_interval=30)
+
+
+def connect_redis_briefly(settings: StoreSettings) -> Redis:
+    """A client for what is nice to have: it asks once, and gives up after a moment."""
+    return _connect(settings, socket_connect_timeout=0.5, socket_timeout=0.5, retry=Retry(NoBackoff(), 0))
+
+
+def _connect(settings: StoreSettings, **options: Any) -> Redis:
+    if (password := settings.redis_password()) is not None:
+        options["password"] = password
+    return Redis.from_url(settings.redis_url, **options)
 
 
 class JobQueue:
@@ -73,6 +89,7 @@ class JobQueue:
 
     def __init__(self, redis: Redis) -> None:
         self.redis = redis
+        self._queues: dict[int, Queue] = {}  # each asks Redis for its version, once
 
     def announce(self, name: str, gib: int, connection: Any = None, *, busy: bool = False) -> None:
         """The worker `name` lives. Called by it every few seconds; `connection` may be a pipeline."""
@@ -85,7 +102,7 @@ class JobQueue:
 
     def workers(self, host: str = "") -> list[str]:
         """Names of the living workers, of one host or of all."""
-        found = self.redis.scan_iter(match=PRESENCE + "*", count=1000)
+        found = self.redis.scan_iter(match=PRESENCE + "*", count=SCANNED)
         names = sorted(_text(key).removeprefix(PRESENCE) for key in found)
         return [name for name in names if not host or name.rpartition("-")[0] == host]
 
@@ -108,17 +125,17 @@ class JobQueue:
         if self.holds(job_id, attempt):
             return False
         with suppress(NoSuchJobError):
-            self._fetch(_rq_id(job_id, attempt)).delete()
+            self._fetch(rq_id(job_id, attempt)).delete()
         return self._enqueue(job_id, attempt, gib, front)
 
     def holds(self, job_id: str, attempt: int) -> bool:
         """Whether Redis will deliver the attempt, or has just delivered it to a worker that may be claiming it."""
-        rq_id = _rq_id(job_id, attempt)
+        name = rq_id(job_id, attempt)
         try:
-            job = self._fetch(rq_id)
+            job = self._fetch(name)
         except NoSuchJobError:
             return False
-        if self.redis.lpos(_key(job.origin), rq_id) is not None:
+        if self.redis.lpos(_key(job.origin), name) is not None:
             return True
         if job.is_finished or job.is_failed or job.is_canceled or job.is_stopped:
             return False
@@ -137,32 +154,41 @@ class JobQueue:
                 continue
             self._remove(name, 0)
 
-    def take_back(self, gib: int, count: int) -> int:
-        """Of what waits for a class, the last `count`. -> how many: a worker may have just come and taken some."""
+    def take_back(self, gib: int, count: int) -> list[str]:
+        """Of what waits for a class, the last `count`. -> what came back: a worker may have just taken some."""
         return self._remove(queue_name(gib), -count)
 
-    def _remove(self, name: str, first: int) -> int:
-        removed, key = 0, _key(name)
-        for rq_id in map(_text, self.redis.lrange(key, first, -1)):
-            if self.redis.lrem(key, 1, rq_id):  # else a worker has just come and taken it
-                removed += 1
+    def _remove(self, queue: str, first: int) -> list[str]:
+        removed, key = [], _key(queue)
+        for name in map(_text, self.redis.lrange(key, first, -1)):
+            if self.redis.lrem(key, 1, name):  # else a worker has just come and taken it
+                removed.append(name)
                 with suppress(NoSuchJobError):
-                    self._fetch(rq_id).delete()
+                    self._fetch(name).delete()
         return removed
 
     def waiting_ids(self, gib: int) -> list[str]:
         """`job-attempt` of all that waits for a class, first to last."""
-        return [_text(rq_id) for rq_id in self.redis.lrange(_key(queue_name(gib)), 0, -1)]
+        return self.waiting_by_class([gib])[gib]
 
-    def _fetch(self, rq_id: str) -> Job:
-        return Job.fetch(rq_id, connection=self.redis, serializer=JSONSerializer)
+    def waiting_by_class(self, classes: Sequence[int]) -> dict[int, list[str]]:
+        """The same for several classes, asked at once."""
+        pipeline = self.redis.pipeline(transaction=False)
+        for gib in classes:
+            pipeline.lrange(_key(queue_name(gib)), 0, -1)
+        return {gib: [_text(name) for name in found] for gib, found in zip(classes, pipeline.execute(), strict=True)}
+
+    def _fetch(self, name: str) -> Job:
+        return Job.fetch(name, connection=self.redis, serializer=JSONSerializer)
 
     def _enqueue(self, job_id: str, attempt: int, gib: int, front: bool) -> bool:
+        if gib not in self._queues:
+            self._queues[gib] = Queue(queue_name(gib), connection=self.redis, serializer=JSONSerializer)
         try:
-            Queue(queue_name(gib), connection=self.redis, serializer=JSONSerializer).enqueue_call(
+            self._queues[gib].enqueue_call(
                 TASK,
                 args=(job_id, attempt),
-                job_id=_rq_id(job_id, attempt),
+                job_id=rq_id(job_id, attempt),
                 timeout=-1,
                 ttl=None,
                 result_ttl=0,
@@ -173,10 +199,6 @@ class JobQueue:
         except DuplicateJobError:
             return False
         return True
-
-
-def _rq_id(job_id: str, attempt: int) -> str:
-    return f"{job_id}-{attempt}"
 
 
 def _key(name: str) -> str:

@@ -7,10 +7,11 @@ How a worker carries a job (`store = open_store(settings)`; RQ calls `advtex_wor
 2. `if store.results.adopt(job_id): return`: an earlier attempt had already finished, only its row was not told.
 3. Fetch the scan: `store.blobs.fetch(claim.scan_key, path)`. Resume: every blob below
    `keys.checkpoints_prefix(job_id)`, attempts in ascending order, laid over one another (`keys.py`).
-4. Every second or two, and from a thread that does not wait for the engine:
-   `lease = store.records.heartbeat(job_id, attempt, progress=…, reached=…)`. `lease.cancel_requested` -> stop the
-   engine with a checkpoint. `StaleAttempt` -> the lease is lost: stop at once, upload nothing more. A heartbeat that
-   fails because the database is away is no loss: try again until `lease_seconds` have passed since the last good one.
+4. Every half second, and from a thread that does not wait for the engine: `store.live_progress.tell(…)` for those who
+   watch, and `lease = store.records.lease(job_id, attempt)`, which writes nothing; every few seconds instead of that
+   `store.records.heartbeat(job_id, attempt, progress=…, reached=…)`. `lease.cancel_requested` -> stop the engine with a
+   checkpoint. `StaleAttempt` -> the lease is lost: stop at once, upload nothing more. A heartbeat that fails because
+   the database is away is no loss: try again until `lease_seconds` have passed since the last good one.
 5. New checkpoint files: `store.blobs.upload(path, keys.checkpoint_prefix(job_id, attempt) + name)`.
 6. The end, one of
    - `store.results.commit(job_id, attempt, {name: path}, warnings)`: uploads the files, writes the manifest once,
@@ -42,7 +43,9 @@ from advtex_store import keys
 from advtex_store.accounts import check_active_jobs
 from advtex_store.database import Database
 from advtex_store.errors import IllegalTransition, RecordNotFound, StaleAttempt
-from advtex_store.models import EventRow, JobRow
+from advtex_store.fair_queue import WaitingJob, distinct_pairs, next_jobs, use_order_of_index
+from advtex_store.models import KEPT, WAITS_FOR_A_REASON, EventRow, JobRow
+from advtex_store.needs import GIB
 from advtex_store.tallies import ATTEMPTS, tally, tally_end
 from advtex_store.troubles import ADOPT, not_aside
 from advtex_store.webhooks import tell_webhooks
@@ -61,6 +64,7 @@ TRANSITIONS: Mapping[JobState, frozenset[JobState]] = {
 }
 WAITING = frozenset({S.queued, S.preempted})
 POISON_DEATHS = 3
+EXPLAINED = 1000  # waiting rows that are told at a time why they wait
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,12 +125,22 @@ class Records:
                 lease=Lease(expires_at, row.cancel_requested),
             )
 
+    def lease(self, job_id: str, attempt: int) -> Lease:
+        """The lease as it is, without a commit. StaleAttempt: it is lost."""
+        with self.database.read() as session:
+            query = select(JobRow.lease_expires_at, JobRow.cancel_requested).where(_held(job_id, attempt))
+            found = session.execute(query).one_or_none()
+            if found is None:
+                raise StaleAttempt(self._why_stale(session, job_id, attempt))
+            return Lease(found.lease_expires_at or 0.0, found.cancel_requested)
+
     def heartbeat(
         self,
         job_id: str,
         attempt: int,
         progress: Progress | None = None,
         *,
+        stages: Sequence[Progress] = (),
         reached: int = 0,
         lease_seconds: float | None = None,
         log_tail: str | None = None,
@@ -134,6 +148,7 @@ class Records:
     ) -> Lease:
         """Keep the lease and tell how far the attempt is. StaleAttempt: the lease is lost.
 
+        stages: how each stage began that did so since the last heartbeat.
         reached: any number that grows with the work and means the same in every attempt (say, stage index times
         10^7 plus step). Deaths count towards poison only while no attempt gets farther than the ones before.
         log_tail: the newest lines of the engine's log, shown if the job has to be given up.
@@ -148,8 +163,10 @@ class Records:
                 row.log_tail = log_tail
             if waiting_reason is not None and (reason := waiting_reason[:255]) != row.waiting_reason:
                 row.waiting_reason, row.updated_at, row.version = reason, now, row.version + 1
-            if progress is not None and (data := progress.model_dump(mode="json")) != row.progress:
-                stage_changed = progress.stage != row.progress.get("stage")
+            for told in stages if progress is None else (*stages, progress):
+                if (data := told.model_dump(mode="json")) == row.progress:
+                    continue
+                stage_changed = told.stage != row.progress.get("stage")
                 row.progress, row.updated_at, row.version = data, now, row.version + 1
                 if stage_changed:
                     _record(session, row, "progress", {name: data[name] for name in data if name != "notes"})
@@ -224,51 +241,44 @@ class Records:
 
     # -- dispatcher and reconciler --------------------------------------------------------------------------------
 
-    def waiting(self, limit: int, memory_bytes: int | None = None) -> list[JobRow]:
-        """Jobs to run next, of those that need no more than `memory_bytes`.
-
-        Preempted ones first. Then owners take turns, those first who have the fewest jobs running; among the jobs of
-        one owner the larger priority comes first, then the older job.
-        """
-        waits: list[ColumnElement[bool]] = [JobRow.state.in_(WAITING), JobRow.deleted_at.is_(None)]
-        if memory_bytes is not None:
-            waits.append(JobRow.memory_bytes <= memory_bytes)
-        running = select(JobRow.owner, func.count().label("jobs")).where(JobRow.state == S.running)
-        held = running.group_by(JobRow.owner).subquery()
-        place = func.row_number().over(
-            partition_by=JobRow.owner, order_by=(JobRow.state != S.preempted, JobRow.priority.desc(), JobRow.id)
-        )
-        turn = (place + func.coalesce(held.c.jobs, 0)).label("turn")
-        order = select(JobRow.id, turn).outerjoin(held, held.c.owner == JobRow.owner).where(*waits).subquery()
-        query = select(JobRow).join(order, order.c.id == JobRow.id)
-        query = query.order_by(JobRow.state != S.preempted, order.c.turn, JobRow.id).limit(limit)
+    def waiting(self, limit: int, memory_bytes: int | None = None) -> list[WaitingJob]:
+        """Jobs to run next, of those that fit a worker of so much memory, as `fair_queue` orders them."""
         with self.database.read() as session:
-            return list(session.scalars(query))
+            return next_jobs(session, limit, None if memory_bytes is None else memory_bytes // GIB)
+
+    def any_preempted(self) -> bool:
+        """Whether a job waits that had to give its worker back."""
+        with self.database.read() as session:
+            return session.scalar(select(JobRow.id).where(JobRow.state == S.preempted, KEPT).limit(1)) is not None
 
     def explain(self, reason: str, *, above: int = -1, up_to: int | None = None) -> None:
-        """Tell why jobs wait that need more than `above` and no more than `up_to` bytes of memory."""
-        where: list[ColumnElement[bool]] = [
-            JobRow.state.in_(WAITING),
-            JobRow.deleted_at.is_(None),
-            JobRow.memory_bytes > above,
-            JobRow.waiting_reason != reason,
-        ]
+        """Tell why jobs wait that need more than `above` and no more than `up_to` bytes of memory (whole GiB).
+
+        A few thousand rows at a time at most: where more wait, those that are left are told the next time.
+        """
+        pairs = distinct_pairs(WAITS_FOR_A_REASON, JobRow.memory_gib, JobRow.waiting_reason)
+        wrong = select(pairs.c.first, pairs.c.second).where(pairs.c.first > above // GIB, pairs.c.second != reason)
         if up_to is not None:
-            where.append(JobRow.memory_bytes <= up_to)
+            wrong = wrong.where(pairs.c.first <= up_to // GIB)
         with self.database.read() as session:
-            if session.scalar(select(JobRow.id).where(*where).limit(1)) is None:
-                return
-        with self.database.write() as session:
-            now = self.database.now(session)
-            values = {"waiting_reason": reason, "version": JobRow.version + 1, "updated_at": now}
-            session.execute(update(JobRow).where(*where).values(**values))
+            use_order_of_index(session)
+            found = session.execute(wrong).all()
+        for gib, told in found:
+            where = and_(WAITS_FOR_A_REASON, JobRow.memory_gib == gib, JobRow.waiting_reason == told)
+            with self.database.write() as session:
+                now = self.database.now(session)
+                # Another server tells them at the same time: what it has locked is left to it.
+                some = select(JobRow.id).where(where).limit(EXPLAINED).with_for_update(skip_locked=True)
+                ids = session.scalars(some).all()
+                values = {"waiting_reason": reason, "version": JobRow.version + 1, "updated_at": now}
+                session.execute(update(JobRow).where(JobRow.id.in_(ids)).values(**values))
 
     def expired(self, limit: int = 100) -> list[tuple[str, int]]:
         """(job, attempt) whose lease has run out, of jobs that were not set aside."""
         with self.database.read() as session:
             now = self.database.now(session)
-            query = select(JobRow.id, JobRow.attempt).where(JobRow.state == S.running, JobRow.lease_expires_at < now)
-            query = query.where(not_aside(ADOPT, JobRow.id, now))
+            query = select(JobRow.id, JobRow.attempt).where(JobRow.state == S.running, KEPT)
+            query = query.where(JobRow.lease_expires_at < now, not_aside(ADOPT, JobRow.id, now))
             return [(job_id, attempt) for job_id, attempt in session.execute(query.limit(limit))]
 
     def count_by_state(self) -> dict[str, int]:

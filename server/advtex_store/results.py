@@ -59,7 +59,7 @@ class Results:
                     name=name, key=key, size=written.size, sha256=written.sha256, content_type=content_type(name)
                 )
             )
-            self.records.heartbeat(job_id, attempt)
+            self.records.lease(job_id, attempt)
         manifest = ResultManifest(attempt=attempt, files=stored, warnings=list(warnings))
         self.records.heartbeat(job_id, attempt)
         if not self.blobs.put_if_absent(keys.result_manifest_key(job_id), manifest.model_dump_json().encode()):

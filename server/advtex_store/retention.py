@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from sqlalchemy import ColumnElement, and_, exists, select, update
 
-from advtex_contract.jobs import TERMINAL, JobState
+from advtex_contract.jobs import TERMINAL
 from advtex_store import keys
 from advtex_store.blobs import Blobs
 from advtex_store.database import Database
 from advtex_store.ids import ID
-from advtex_store.models import JobRow, UploadRow
+from advtex_store.models import KEPT, UNPURGED, UNTIDY, JobRow, UploadRow
 from advtex_store.troubles import PURGE, SWEEP, TIDY, Troubles, not_aside
 
 BATCH = 100
+HIDDEN = 1000  # rows at a time
 SETTLED_SECONDS = 600.0  # after a job's end; attempts that lost it have noticed by then
 
 
@@ -25,29 +26,20 @@ class Retention:
         self.troubles = Troubles(database, blobs)
 
     def expire(self) -> None:
-        """Hide ended jobs, and uploads without a job, that are past the time that was announced for them."""
+        """Hide ended jobs, and uploads without a job, that are past the time that was announced for them: the first
+        few hundred, so that a long night's jobs are not hidden in one transaction."""
         in_use = exists().where(JobRow.upload_id == UploadRow.id, JobRow.deleted_at.is_(None))
+        self._hide(JobRow, JobRow.state.in_(TERMINAL))
+        self._hide(UploadRow, ~in_use)
+
+    def _hide(self, table: type[JobRow] | type[UploadRow], condition: ColumnElement[bool]) -> None:
         with self.database.read() as session:
             now = self.database.now(session)
-            due_job = session.scalar(
-                select(JobRow.id).where(JobRow.expires_at < now, JobRow.deleted_at.is_(None)).limit(1)
-            )
-            due_upload = session.scalar(
-                select(UploadRow.id).where(UploadRow.expires_at < now, UploadRow.deleted_at.is_(None), ~in_use).limit(1)
-            )
-        if due_job is None and due_upload is None:
-            return
-        with self.database.write() as session:
-            session.execute(
-                update(JobRow)
-                .where(JobRow.expires_at < now, JobRow.deleted_at.is_(None), JobRow.state.in_(TERMINAL))
-                .values(deleted_at=now)
-            )
-            session.execute(
-                update(UploadRow)
-                .where(UploadRow.expires_at < now, UploadRow.deleted_at.is_(None), ~in_use)
-                .values(deleted_at=now)
-            )
+            due = and_(table.expires_at < now, KEPT, condition)
+            ids = session.scalars(select(table.id).where(due).order_by(table.expires_at).limit(HIDDEN)).all()
+        if ids:
+            with self.database.write() as session:
+                session.execute(update(table).where(table.id.in_(ids), due).values(deleted_at=now))
 
     def purge(self) -> int:
         """Remove the blobs of hidden rows, as far as they can be removed. -> how many rows were looked at."""
@@ -73,8 +65,7 @@ class Retention:
         """
         with self.database.read() as session:
             now = self.database.now(session)
-            query = select(JobRow).where(JobRow.state == JobState.succeeded, JobRow.tidied_at.is_(None))
-            query = query.where(JobRow.finished_at < now - SETTLED_SECONDS, JobRow.deleted_at.is_(None))
+            query = select(JobRow).where(UNTIDY, JobRow.finished_at < now - SETTLED_SECONDS)
             rows = session.scalars(query.where(not_aside(TIDY, JobRow.id, now)).limit(BATCH)).all()
         for row in rows:
             with self.troubles.of(TIDY, row.id):
@@ -145,4 +136,4 @@ class Retention:
 
 
 def _hidden(table: type[JobRow] | type[UploadRow], now: float) -> ColumnElement[bool]:
-    return and_(table.deleted_at.is_not(None), table.purged_at.is_(None), not_aside(PURGE, table.id, now))
+    return and_(UNPURGED, not_aside(PURGE, table.id, now))

@@ -9,8 +9,9 @@ from advtex_store.batches import Batches
 from advtex_store.blobs import Blobs, open_blobs
 from advtex_store.database import Database
 from advtex_store.live import Live
+from advtex_store.live_progress import LiveProgress
 from advtex_store.overviews import Overviews
-from advtex_store.queue import JobQueue, connect_redis
+from advtex_store.queue import JobQueue, connect_redis, connect_redis_briefly
 from advtex_store.records import Records
 from advtex_store.references import References
 from advtex_store.results import Results
@@ -40,6 +41,7 @@ class Store:
     references: References
     results: Results
     live: Live
+    live_progress: LiveProgress
     webhooks: Webhooks
     tallies: Tallies
     troubles: Troubles
@@ -49,6 +51,7 @@ class Store:
         """Close connections."""
         self.database.close()
         self.queue.redis.close()
+        self.live_progress.redis.close()
 
 
 def open_store(settings: StoreSettings) -> Store:
@@ -71,6 +74,7 @@ def open_store(settings: StoreSettings) -> Store:
         references=References(settings.reference_roots.split()),
         results=Results(records, blobs),
         live=Live(blobs),
+        live_progress=LiveProgress(connect_redis_briefly(settings)),
         webhooks=Webhooks(database),
         tallies=Tallies(database),
         troubles=Troubles(database, blobs),

@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 
 from advtex_contract.jobs import JobState
 from advtex_store.database import Database
-from advtex_store.models import DeliveryRow, JobRow, TallyRow
+from advtex_store.models import KEPT, DeliveryRow, JobRow, TallyRow
 
 # In the order in which one transaction may count: all in the same, or two of them could wait for each other.
 ATTEMPTS = "attempts"  # ended early, by how: lost, preempted
@@ -23,10 +23,9 @@ STAGES = "stages"  # seconds, of jobs that ended
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """What there is to do now: jobs that wait, the age of the oldest of them in seconds, steps per second of all that
-    run, and webhook deliveries that wait."""
+    """What there is to do now: the age of the oldest job that waits in seconds, steps per second of all that run, and
+    webhook deliveries that wait."""
 
-    waiting: int
     oldest_seconds: float
     steps_per_second: float
     deliveries: int
@@ -68,19 +67,21 @@ class Tallies:
 
     def pauses(self) -> list[str]:
         """Why running jobs pause, each reason once."""
-        query = select(JobRow.waiting_reason).where(JobRow.state == JobState.running, JobRow.waiting_reason != "")
+        query = select(JobRow.waiting_reason).where(JobRow.state == JobState.running, KEPT, JobRow.waiting_reason != "")
         with self.database.read() as session:
             return sorted(set(session.scalars(query)))
 
     def load(self) -> Load:
         """How much there is to do."""
-        waiting = select(func.count(), func.min(JobRow.created_at)).where(
-            JobRow.state.in_((JobState.queued, JobState.preempted)), JobRow.deleted_at.is_(None)
-        )
         with self.database.read() as session:
-            count, oldest = session.execute(waiting).one()
-            running = session.scalars(select(JobRow.progress).where(JobRow.state == JobState.running))
+            now = self.database.now(session)
+            oldest = [
+                session.scalar(
+                    select(JobRow.created_at).where(JobRow.state == state, KEPT).order_by(JobRow.id).limit(1)
+                )
+                for state in (JobState.queued, JobState.preempted)
+            ]
+            running = session.scalars(select(JobRow.progress).where(JobRow.state == JobState.running, KEPT))
             rate = sum(progress.get("steps_per_second") or 0.0 for progress in running)
             deliveries = session.scalar(select(func.count()).select_from(DeliveryRow)) or 0
-            age = self.database.now(session) - oldest if count else 0.0
-            return Load(int(count), age, rate, deliveries)
+        return Load(max((now - made for made in oldest if made is not None), default=0.0), rate, deliveries)

@@ -298,5 +298,6 @@ def _multiply_jobs(live: Any, count: int) -> None:
 
     table = JobRow.__table__
     with live.store.database.write() as session:
-        row = dict(session.execute(select(table).order_by(table.c.id.desc())).mappings().first())
+        columns = [column for column in table.c if column.computed is None]
+        row = dict(session.execute(select(*columns).order_by(table.c.id.desc())).mappings().first())
         session.execute(insert(table), [{**row, "id": f"{n:028x}", "label": f"job {n}"} for n in range(count)])

@@ -4,16 +4,29 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
+from alembic import command
 from alembic.autogenerate import compare_metadata
+from alembic.config import Config
 from alembic.migration import MigrationContext
 from sqlalchemy import text
 from sqlalchemy.exc import IntegrityError
 
+import advtex_store.database
 from advtex_store.database import Database, connect, upgrade_database
 from advtex_store.models import Base
 from advtex_store.settings import StoreSettings
+
+# Rows as a server at revision 0005 writes them.
+OLD_UPLOAD = """insert into uploads (id, owner, filename, size, "offset", tus_metadata, created_at)
+    values ('u', 'me', '', 1, 1, '', 0)"""
+OLD_JOB = """insert into jobs (id, owner, upload_id, state, label, options, priority, memory_bytes, waiting_reason,
+    attempt, cancel_requested, reached, reached_at_claim, deaths, log_tail, progress, warnings, results, version,
+    created_at, updated_at, retention_seconds)
+    values (:id, 'me', 'u', 'queued', '', '{}', 0, :memory, '', 1, false, 0, 0, 0, '', '{}', '[]', '[]', 1, 0, 0, 60)"""
 
 
 def test_migrations_lead_to_the_models(database_url: str) -> None:
@@ -51,6 +64,53 @@ def test_several_servers_migrate_at_once(kind: str, tmp_path, postgres_server: s
     with database.read() as session:
         assert session.execute(text("select count(*) from alembic_version")).scalar_one() == 1
     database.close()
+
+
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_lines_come_to_an_old_database_and_go_again(kind: str, tmp_path, postgres_server: str) -> None:
+    """With 100,000 jobs in it, and without waiting long; rows of an older server have their class too."""
+    url = f"sqlite:///{tmp_path}/old.db"
+    if kind == "postgresql":
+        url = f"{postgres_server}lines".replace("postgresql:", "postgresql+psycopg:")
+        admin = connect(url.replace("/lines", "/postgres")).execution_options(isolation_level="AUTOCOMMIT")
+        with admin.connect() as connection:
+            connection.execute(text("create database lines"))
+        admin.dispose()
+    engine = connect(url)
+    config = Config()
+    config.set_main_option("script_location", str(Path(advtex_store.database.__file__).parent / "migrations"))
+
+    def migrate(act: Callable[[Config, str], None], revision: str) -> None:
+        with engine.connect().execution_options(write=True) as connection, connection.begin():
+            config.attributes["connection"] = connection
+            act(config, revision)
+
+    def add_jobs(first: int, count: int) -> None:
+        jobs = [{"id": f"{n:08x}", "memory": (n % 5) << 29} for n in range(first, first + count)]
+        with engine.connect().execution_options(write=True) as connection, connection.begin():
+            connection.execute(text(OLD_JOB), jobs)
+
+    def classes() -> list[tuple[int, int, int]]:
+        query = "select memory_bytes, memory_gib, count(*) from jobs group by 1, 2 order by 1"
+        with engine.connect() as connection:
+            return [tuple(row) for row in connection.execute(text(query))]
+
+    migrate(command.upgrade, "0005")
+    with engine.connect().execution_options(write=True) as connection, connection.begin():
+        connection.execute(text(OLD_UPLOAD))
+    add_jobs(0, 100_000)
+    began = time.monotonic()
+    migrate(command.upgrade, "0008")
+    assert time.monotonic() - began < 60
+    add_jobs(100_000, 5)  # by a server that does not know of classes
+    sizes = [(0, 0), (1 << 29, 1), (1 << 30, 1), (3 << 29, 2), (1 << 31, 2)]
+    assert classes() == [(size, gib, 20_001) for size, gib in sizes]
+    migrate(command.downgrade, "0005")
+    with engine.connect() as connection:
+        assert connection.execute(text("select count(*) from jobs where state = 'queued'")).scalar_one() == 100_005
+    migrate(command.upgrade, "0008")
+    assert classes() == [(size, gib, 20_001) for size, gib in sizes]
+    engine.dispose()
 
 
 def test_connections_that_open_a_new_file_at_once_wait_for_each_other(tmp_path) -> None:

@@ -67,6 +67,7 @@ def test_only_one_of_many_gets_the_job(bench: Any) -> None:
     "act",
     [
         lambda r, j: r.claim(j, 1, "w"),
+        lambda r, j: r.lease(j, 1),
         lambda r, j: r.heartbeat(j, 1),
         lambda r, j: r.succeed(j, 1, []),
         lambda r, j: r.fail(j, 1, ERROR),
@@ -75,7 +76,7 @@ def test_only_one_of_many_gets_the_job(bench: Any) -> None:
         lambda r, j: r.preempt(j, 1),
         lambda r, j: r.lost(j, 1),
     ],
-    ids=["claim", "heartbeat", "succeed", "fail", "reject", "canceled", "preempt", "lost"],
+    ids=["claim", "lease", "heartbeat", "succeed", "fail", "reject", "canceled", "preempt", "lost"],
 )
 def test_a_stale_attempt_can_do_nothing(bench: Any, act: Callable[[Any, str], object]) -> None:
     job = bench.job()
@@ -109,6 +110,16 @@ def test_a_heartbeat_in_time_keeps_the_job(bench: Any) -> None:
     with pytest.raises(StaleAttempt, match="still holds"):
         bench.records.lost(job, 1, expired_only=True)
     assert bench.state(job) == ("running", 1)
+
+
+def test_a_look_at_the_lease_does_not_renew_it(bench: Any) -> None:
+    job = bench.job()
+    claimed = bench.records.claim(job, 1, "w").lease
+    bench.clock.now += 10
+    assert bench.records.lease(job, 1) == claimed
+    bench.records.cancel(job)
+    assert bench.records.lease(job, 1).cancel_requested
+    assert bench.records.job(job).lease_expires_at == claimed.expires_at
 
 
 def test_preempted_goes_to_the_front_and_is_no_failure(bench: Any) -> None:
@@ -248,6 +259,17 @@ def test_events_are_changes_of_state_and_stage(bench: Any) -> None:
     assert versions == sorted(set(versions))
     assert versions[-1] == bench.records.job(job).version
     assert [e.version for e in bench.records.events(job, versions[2])] == versions[3:]
+
+
+def test_stages_between_two_heartbeats_are_recorded(bench: Any) -> None:
+    job = bench.job()
+    bench.records.claim(job, 1, "w")
+    stages = [Progress(stage=name) for name in ("ingest", "atlas", "optimization")]
+    bench.records.heartbeat(job, 1, Progress(stage="optimization", step=7), stages=stages)
+    bench.records.heartbeat(job, 1, Progress(stage="optimization", step=8))
+    told = [event.data["stage"] for event in bench.records.events(job, 0) if event.data["kind"] == "progress"]
+    assert told == ["ingest", "atlas", "optimization"]
+    assert bench.records.job(job).progress["step"] == 8
 
 
 def test_a_heartbeat_that_says_nothing_new_is_no_change(bench: Any) -> None:

@@ -106,7 +106,8 @@ def test_a_cancel_in_a_long_stage_is_recorded_within_two_seconds(
     store: Store, settings: WorkerSettings, new_job: NewJob, engine: str, ends: str | None, asked_before: bool
 ) -> None:
     """The runner ends by itself; only one that cannot run Python at all is killed. A drain before changes nothing."""
-    usual = {name: WorkerSettings.model_fields[name].default for name in ("heartbeat_seconds", "grace_seconds")}
+    names = ("lease_seconds", "heartbeat_seconds", "grace_seconds")
+    usual = {name: WorkerSettings.model_fields[name].default for name in names}
     given = Host(settings.model_copy(update=usual), engine=f"fake_engines:{engine}")
     job_id = new_job()
     with structlog.testing.capture_logs() as lines:

@@ -9,6 +9,8 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,6 +27,7 @@ from advtex_engine.core.monitor import STAGES
 from advtex_store.errors import StaleAttempt
 from advtex_store.queue import TASK
 from advtex_store.records import Lease
+from advtex_worker import lease
 from advtex_worker.adapt import texture_config
 from advtex_worker.child import death_sentence
 from advtex_worker.events import (
@@ -215,6 +218,8 @@ class FakeRecords:
     def __init__(self) -> None:
         self.answer: Lease | Exception = Lease(math.inf, False)
         self.heard: list[tuple[Any, int, str | None]] = []
+        self.stages: list[str] = []
+        self.looks = 0
 
     def heartbeat(
         self,
@@ -222,24 +227,31 @@ class FakeRecords:
         attempt: int,
         progress: Progress | None = None,
         *,
+        stages: Sequence[Progress],
         reached: int,
         log_tail: str | None,
         waiting_reason: str,
     ) -> Lease:
         self.heard.append((progress, reached, log_tail))
+        self.stages += [told.stage for told in stages]
+        return self.lease(job_id, attempt)
+
+    def lease(self, job_id: str, attempt: int) -> Lease:
+        self.looks += 1
         if isinstance(self.answer, Exception):
             raise self.answer
         return self.answer
 
 
-def keeper(records: FakeRecords, endings: list[Ending], tail: str = "") -> LeaseKeeper:
-    return LeaseKeeper(records, "job", 1, interval=60.0, on_ending=endings.append, log_tail=lambda: tail)  # type: ignore[arg-type]
+def keeper(records: FakeRecords, on_ending: Callable[[Ending], object], tail: str = "", **changed: Any) -> LeaseKeeper:
+    options = {"interval": 60.0, "show": lambda *_: None} | changed
+    return LeaseKeeper(records, "job", 1, on_ending=on_ending, log_tail=lambda: tail, **options)  # type: ignore[arg-type]
 
 
 def test_a_database_that_is_away_costs_nothing_until_the_lease_runs_out() -> None:
     records, ended = FakeRecords(), threading.Event()
     records.lease_seconds = 0.5
-    kept = LeaseKeeper(records, "job", 1, interval=0.01, on_ending=lambda _: ended.set(), log_tail=lambda: "")  # type: ignore[arg-type]
+    kept = keeper(records, lambda _: ended.set(), interval=0.01)
     began = time.monotonic()
     kept.start()
     assert not ended.wait(2 * records.lease_seconds), "the heartbeats renew it"
@@ -259,7 +271,7 @@ def test_a_heartbeat_that_hangs_does_not_hide_the_end_of_the_lease() -> None:
         return Lease(math.inf, False)
 
     records.heartbeat = hang  # type: ignore[method-assign]
-    kept = LeaseKeeper(records, "job", 1, interval=0.01, on_ending=lambda _: ended.set(), log_tail=lambda: "")  # type: ignore[arg-type]
+    kept = keeper(records, lambda _: ended.set(), interval=0.01)
     kept.start()
     assert ended.wait(5.0)
     hung.set()
@@ -280,7 +292,7 @@ def test_memory_is_the_smallest_gpus_or_the_machines(tmp_path: Path, monkeypatch
 
 def test_a_stale_attempt_is_told_once_and_overrules_a_cancel() -> None:
     records, endings = FakeRecords(), []
-    kept = keeper(records, endings)
+    kept = keeper(records, endings.append)
     records.answer = Lease(math.inf, True)
     kept.beat()
     kept.beat()
@@ -292,9 +304,50 @@ def test_a_stale_attempt_is_told_once_and_overrules_a_cancel() -> None:
     assert kept.ending is Ending.lost
 
 
+def test_the_row_is_written_every_few_seconds_and_watchers_see_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [1000.0]
+    monkeypatch.setattr(lease, "_now", lambda: now[0])
+    records, endings, shown = FakeRecords(), [], []
+    records.lease_seconds = 60.0
+    kept = keeper(records, endings.append, show=lambda progress, paused: shown.append((progress, paused)))
+    stages = ["ingest", "atlas", "atlas", "optimization"]
+    told = []
+    for turn in range(60):
+        progress = Progress(stage=stages[min(turn // 3, 3)], step=turn // 2)
+        kept.report(progress, turn)
+        kept.paused = "no room" if turn == 41 else ""
+        told.append((progress, kept.paused))
+        kept.turn()
+        now[0] += 0.5
+    assert records.looks == 60, "a cancel is seen at every turn"
+    assert [reached for _, reached, _ in records.heard] == [10, 20, 30, 40, 50], "once in five seconds"
+    assert records.stages == ["ingest", "atlas", "optimization"], "also those that were left before"
+    assert shown == [news for before, news in pairwise([None, *told]) if news != before]
+    records.answer = Lease(math.inf, True)
+    kept.turn()
+    assert (endings, len(records.heard)) == ([Ending.cancel], 6)
+
+
+def test_what_did_not_get_through_is_told_again_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [1000.0]
+    monkeypatch.setattr(lease, "_now", lambda: now[0])
+    records = FakeRecords()
+    records.lease_seconds = 60.0
+    kept = keeper(records, print)
+    kept.report(Progress(stage="ingest"), 1)
+    now[0] += 6.0
+    records.answer = ConnectionError("no route")
+    kept.turn()
+    kept.report(Progress(stage="atlas"), 2)
+    records.answer, records.stages = Lease(math.inf, False), []
+    kept.turn()
+    kept.turn()
+    assert (len(records.heard), records.stages) == (2, ["ingest", "atlas"])
+
+
 def test_progress_and_a_changed_log_travel_with_the_heartbeat() -> None:
     records = FakeRecords()
-    kept = keeper(records, [], tail="line 1")
+    kept = keeper(records, print, tail="line 1")
     kept.report(Progress(stage="atlas"), 7)
     kept.beat()
     kept.beat()

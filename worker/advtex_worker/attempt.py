@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, wait
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -153,6 +154,7 @@ class Attempt:
             interval=settings.heartbeat_seconds,
             on_ending=self._on_ending,
             log_tail=self._log_tail,
+            show=partial(store.live_progress.tell, claim.job_id, claim.attempt),
         )
         self._child: Child | None = None
         self._killers: list[threading.Timer] = []
@@ -201,8 +203,8 @@ class Attempt:
         self._check_ending()
         self._warnings = base.warnings
         self._log.info("attempt begins", resumed_files=len(base.files))
-        uploader = CheckpointUploader(self._store.blobs, self._job_id, self._number, base, self._keeper.beat)
-        poster = LivePoster(self._store.live, self._job_id, self._number, self._keeper.beat)
+        uploader = CheckpointUploader(self._store.blobs, self._job_id, self._number, base, self._keeper.held)
+        poster = LivePoster(self._store.live, self._job_id, self._number, self._keeper.held)
         ended: FinishedEvent | FailedEvent | StoppedEvent | None = None
         try:
             with self._spawn(resume=bool(base.files)) as child:

@@ -11,8 +11,10 @@ import structlog
 
 from advtex_contract.jobs import Progress
 from advtex_store.errors import StaleAttempt
-from advtex_store.records import Records
+from advtex_store.records import Lease, Records
 
+ROW_SECONDS = 5.0  # between renewals: a commit each
+ROW_SHARE = 0.1  # of the lease, where that is less
 HELD_SHARE = 0.9  # of the lease; then the run is ended, so that it is over before another one may begin
 WATCH_SECONDS = 1.0
 
@@ -30,9 +32,10 @@ class Ending(StrEnum):
 class LeaseKeeper:
     """Renews the lease with the newest progress, and finds out that the user or the server wants the run ended.
 
-    A database that cannot be reached is no loss until the lease is about to run out; a second thread watches that,
-    since a heartbeat may hang. `on_ending` is called from these threads, once per reason. `paused`: set from outside,
-    why the run does not go on at the moment, for people.
+    The row is looked at after every `interval`, and written every few seconds. `show` is given what changes meanwhile,
+    for those who watch: the progress, and why the run pauses. A database that cannot be reached is no loss until the
+    lease is about to run out; a second thread watches that, since a heartbeat may hang. `on_ending` is called from
+    these threads, once per reason. `paused`: set from outside, why the run does not go on at the moment, for people.
     """
 
     def __init__(
@@ -44,6 +47,7 @@ class LeaseKeeper:
         interval: float,
         on_ending: Callable[[Ending], None],
         log_tail: Callable[[], str],
+        show: Callable[[Progress, str], None],
     ) -> None:
         self._records = records
         self._job_id = job_id
@@ -51,9 +55,13 @@ class LeaseKeeper:
         self._interval = interval
         self._on_ending = on_ending
         self._log_tail = log_tail
+        self._show = show
         self._told_tail = ""
         self._progress: tuple[Progress | None, int] = (None, 0)
+        self._stages: list[Progress] = []
+        self._shown: tuple[Progress | None, str] = (None, "")
         self._held_until = self._until()
+        self._next_beat = _now() + self._rest()  # the claim has just been one
         self._done = threading.Event()
         self._beating = threading.Lock()
         self._deciding = threading.Lock()
@@ -77,6 +85,9 @@ class LeaseKeeper:
 
     def report(self, progress: Progress, reached: int) -> None:
         """What the next heartbeat tells."""
+        before, _ = self._progress
+        if before is None or before.stage != progress.stage:
+            self._stages.append(progress)
         self._progress = (progress, reached)
 
     def end(self, ending: Ending) -> None:
@@ -92,34 +103,60 @@ class LeaseKeeper:
     def beat(self) -> bool:
         """Renew now. -> whether the attempt still holds its job."""
         with self._beating:
-            progress, reached = self._progress
-            tail = self._log_tail()
-            news = tail if tail != self._told_tail else None
-            until = self._until()  # taken before it is asked for: the rows' lease ends later than this
-            try:
-                lease = self._records.heartbeat(
-                    self._job_id,
-                    self._attempt,
-                    progress,
-                    reached=reached,
-                    log_tail=news,
-                    waiting_reason=self.paused,
-                )
-            except StaleAttempt as error:
-                log.warning("lease lost", job=self._job_id, attempt=self._attempt, reason=str(error))
-                self.end(Ending.lost)
-                return False
-            except Exception as error:  # whatever the database driver calls its being away
-                log.warning("heartbeat failed", job=self._job_id, attempt=self._attempt, error=str(error))
-                return self.ending is not Ending.lost
-            self._held_until, self._told_tail = until, tail
-            if lease.cancel_requested:
-                self.end(Ending.cancel)
-            return True
+            return self._ask(self._renew)
+
+    def held(self) -> bool:
+        """Whether the attempt still holds its job, without a renewal."""
+        return self._ask(lambda: self._records.lease(self._job_id, self._attempt))
+
+    def turn(self) -> None:
+        """What is due: tell those who watch, then renew the lease or see at least how it is."""
+        news = (self._progress[0], self.paused)
+        if news != self._shown and news[0] is not None:
+            self._show(news[0], news[1])
+            self._shown = news
+        if _now() >= self._next_beat:
+            self.beat()
+        else:
+            self.held()
+
+    def _renew(self) -> Lease:
+        progress, reached = self._progress
+        stages = self._stages[:]
+        tail = self._log_tail()
+        until = self._until()  # taken before it is asked for: the rows' lease ends later than this
+        lease = self._records.heartbeat(
+            self._job_id,
+            self._attempt,
+            progress,
+            stages=stages,
+            reached=reached,
+            log_tail=tail if tail != self._told_tail else None,
+            waiting_reason=self.paused,
+        )
+        self._held_until, self._told_tail = until, tail
+        self._next_beat = _now() + self._rest()
+        del self._stages[: len(stages)]
+        return lease
+
+    def _ask(self, ask: Callable[[], Lease]) -> bool:
+        """The rows. -> whether the attempt still holds its job, as far as is known."""
+        try:
+            lease = ask()
+        except StaleAttempt as error:
+            log.warning("lease lost", job=self._job_id, attempt=self._attempt, reason=str(error))
+            self.end(Ending.lost)
+            return False
+        except Exception as error:  # whatever the database driver calls its being away
+            log.warning("heartbeat failed", job=self._job_id, attempt=self._attempt, error=str(error))
+            return self.ending is not Ending.lost
+        if lease.cancel_requested:
+            self.end(Ending.cancel)
+        return True
 
     def _work(self) -> None:
         while not self._done.wait(self._interval):
-            self.beat()
+            self.turn()
 
     def _watch(self) -> None:
         while (left := self._held_until - _now()) > 0:
@@ -127,6 +164,9 @@ class LeaseKeeper:
                 return
         log.warning("no heartbeat got through in time", job=self._job_id, attempt=self._attempt)
         self.end(Ending.lost)
+
+    def _rest(self) -> float:
+        return min(ROW_SECONDS, self._records.lease_seconds * ROW_SHARE)
 
     def _until(self) -> float:
         return _now() + self._records.lease_seconds * HELD_SHARE

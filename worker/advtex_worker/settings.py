@@ -28,7 +28,9 @@ class WorkerSettings(StoreSettings):
     refused_seconds: float = Field(
         default=600.0, ge=0, description="a job ends after the storage has refused it for so long: no right, no bucket"
     )
-    heartbeat_seconds: float = Field(default=0.5, gt=0, description="between renewals of the lease")
+    heartbeat_seconds: float = Field(
+        default=0.5, gt=0, description="between looks at the job's row, and news for those who watch"
+    )
     log_level: str = Field(default="INFO", pattern=r"^(DEBUG|INFO|WARNING|ERROR)$")
 
     @property

@@ -141,7 +141,11 @@ def test_pages_call_commands_of_all_kinds() -> None:
     assert len(commands()) > 15
 
 
-@pytest.mark.parametrize(("command", "options"), commands().items(), ids=lambda value: " ".join(value))
+@pytest.mark.parametrize(
+    ("command", "options"),
+    commands().items(),
+    ids=lambda value: " ".join(sorted(value) if isinstance(value, set) else value),
+)
 def test_every_command_that_is_shown_has_its_options(command: tuple[str, ...], options: set[str]) -> None:
     module, _, function = SCRIPTS[command[0]].partition(":")
     code = f"import sys; from {module} import {function} as main; sys.exit(main())"

@@ -64,7 +64,7 @@ TRANSITIONS: Mapping[JobState, frozenset[JobState]] = {
 }
 WAITING = frozenset({S.queued, S.preempted})
 POISON_DEATHS = 3
-EXPLAINED = 1000  # waiting rows that are told at a time why they wait
+EXPLAINED = 1000  # waiting rows that are told in one go why they wait
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,7 +254,7 @@ class Records:
     def explain(self, reason: str, *, above: int = -1, up_to: int | None = None) -> None:
         """Tell why jobs wait that need more than `above` and no more than `up_to` bytes of memory (whole GiB).
 
-        A few thousand rows at a time at most: where more wait, those that are left are told the next time.
+        A thousand rows at most: where more wait, those that are left are told the next time.
         """
         pairs = distinct_pairs(WAITS_FOR_A_REASON, JobRow.memory_gib, JobRow.waiting_reason)
         wrong = select(pairs.c.first, pairs.c.second).where(pairs.c.first > above // GIB, pairs.c.second != reason)
@@ -263,15 +263,18 @@ class Records:
         with self.database.read() as session:
             use_order_of_index(session)
             found = session.execute(wrong).all()
+        left = EXPLAINED
         for gib, told in found:
             where = and_(WAITS_FOR_A_REASON, JobRow.memory_gib == gib, JobRow.waiting_reason == told)
             with self.database.write() as session:
                 now = self.database.now(session)
                 # Another server tells them at the same time: what it has locked is left to it.
-                some = select(JobRow.id).where(where).limit(EXPLAINED).with_for_update(skip_locked=True)
+                some = select(JobRow.id).where(where).limit(left).with_for_update(skip_locked=True)
                 ids = session.scalars(some).all()
                 values = {"waiting_reason": reason, "version": JobRow.version + 1, "updated_at": now}
                 session.execute(update(JobRow).where(JobRow.id.in_(ids)).values(**values))
+            if (left := left - len(ids)) == 0:
+                return
 
     def expired(self, limit: int = 100) -> list[tuple[str, int]]:
         """(job, attempt) whose lease has run out, of jobs that were not set aside."""

@@ -116,7 +116,8 @@ def test_a_look_costs_what_it_finds_and_not_what_waits(bench: Any) -> None:
 
 def test_servers_that_tell_why_jobs_wait_at_once_tell_each_job_once(bench: Any) -> None:
     """And a great many of them in several goes, so that no transaction is long."""
-    jobs: list[Job] = [("a", JobState.queued, 0, (n % 2) * 20 * GIB, False) for n in range(2 * EXPLAINED + 500)]
+    sizes = (0, 20 * GIB, 0, 30 * GIB)
+    jobs: list[Job] = [("a", JobState.queued, 0, sizes[n % 4], False) for n in range(2 * EXPLAINED + 500)]
     fill(bench, bench.finished_upload(), jobs)
 
     def told() -> dict[str, int]:

@@ -40,11 +40,9 @@ from advtex_client.client import Client
 from advtex_client.deep import deep_lines, deep_report
 from advtex_client.doctor import examine
 from advtex_client.errors import ScanRejectedError
-from advtex_contract.jobs import TERMINAL, JobState, JobView
+from advtex_contract.jobs import RETRYABLE, TERMINAL, JobState, JobView
 from advtex_contract.options import Method, Preset
 from advtex_scan.check import check_scan
-
-RETRYABLE = (JobState.failed, JobState.canceled)
 
 app = typer.Typer(
     help="Texture RGB-D scans on an advtex server.",

@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.concurrency import run_in_threadpool
 
-from advtex_contract.jobs import TERMINAL, JobState
+from advtex_contract.jobs import TERMINAL
 from advtex_server.service import Service, job_view
 from advtex_store.errors import RecordNotFound
 from advtex_store.models import EventRow, JobRow
@@ -77,7 +77,7 @@ async def stream_events(
             yield "".join(_message(e.data["kind"], e.version, json.dumps(e.data)) for e in _until(recorded, row))
             yield message
             seen, spoken, first = max(seen, row.version), time.monotonic(), False
-        if JobState(row.state) in TERMINAL:
+        if row.state in TERMINAL:
             return
         if time.monotonic() - spoken > PING_SECONDS:
             yield ": ping\n\n"

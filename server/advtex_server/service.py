@@ -17,6 +17,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from advtex_contract.errors import ErrorCode, ErrorDetail
 from advtex_contract.health import KeyView
 from advtex_contract.jobs import (
+    WAITING,
     JobError,
     JobPage,
     JobSpec,
@@ -39,7 +40,6 @@ from advtex_store.blobs import FolderBlobs
 from advtex_store.errors import BlobNotFound, ReferenceRefused, StoreError
 from advtex_store.models import JobRow
 from advtex_store.needs import needed_memory
-from advtex_store.records import WAITING
 from advtex_store.results import StoredFile
 from advtex_store.store import Store
 from advtex_store.submissions import HOLD_SECONDS, JobFilter, Reservation
@@ -247,8 +247,8 @@ def _rejection(details: list[ErrorDetail]) -> JobError:
 
 def job_view(row: JobRow) -> JobView:
     """The row as the API shows it."""
-    state = JobState(row.state)
-    paused = row.waiting_reason if state is JobState.running else ""
+    state = row.state
+    paused = row.waiting_reason if state == JobState.running else ""
     results = [
         ResultFile(
             name=f["name"],

@@ -1,4 +1,4 @@
-"""Job rows, and the one table of legal state transitions.
+"""Job rows, and what may become of them (`STATES` in `advtex_contract.jobs`).
 
 How a worker carries a job (`store = open_store(settings)`; RQ calls `advtex_worker.tasks.run_job(job_id, attempt)`):
 
@@ -36,7 +36,7 @@ from sqlalchemy import ColumnElement, and_, func, select, update
 from sqlalchemy.orm import Session
 
 from advtex_contract.errors import ErrorDetail
-from advtex_contract.jobs import TERMINAL, JobError, JobState, Progress
+from advtex_contract.jobs import RETRYABLE, STATES, TERMINAL, WAITING, JobError, JobState, Progress
 from advtex_contract.options import JobOptions
 from advtex_store import keys
 from advtex_store.accounts import check_active_jobs
@@ -48,18 +48,6 @@ from advtex_store.troubles import ADOPT, not_aside
 from advtex_store.webhooks import tell_webhooks
 
 S = JobState
-TRANSITIONS: Mapping[JobState, frozenset[JobState]] = {
-    S.uploading: frozenset({S.queued, S.rejected, S.canceled}),
-    # A waiting job can succeed: a late attempt's manifest is adopted instead of doing the work again.
-    S.queued: frozenset({S.running, S.succeeded, S.canceled}),
-    S.preempted: frozenset({S.running, S.succeeded, S.canceled}),
-    S.running: frozenset({S.queued, S.preempted, S.succeeded, S.failed, S.canceled, S.rejected}),
-    S.failed: frozenset({S.queued}),
-    S.canceled: frozenset({S.queued}),
-    S.succeeded: frozenset(),
-    S.rejected: frozenset(),
-}
-WAITING = frozenset({S.queued, S.preempted})
 POISON_DEATHS = 3
 
 
@@ -308,8 +296,7 @@ class Records:
             row = self._get(session, job_id, owner, lock=True)
             check_active_jobs(session, row.owner, max_active_jobs)
             ended = {"cancel_requested": False, "error": None, "finished_at": None, "expires_at": None, "deaths": 0}
-            sources = frozenset({S.failed, S.canceled})
-            return self._move(session, job_id, S.queued, sources=sources, **ended, **_released(row.attempt + 1))
+            return self._move(session, job_id, S.queued, sources=RETRYABLE, **ended, **_released(row.attempt + 1))
 
     def delete(self, job_id: str, owner: str | None = None) -> None:
         """Hide an ended job; its blobs follow (`purged`)."""
@@ -353,8 +340,8 @@ class Records:
         sources: frozenset[JobState] | None = None,
         **values: Any,
     ) -> JobRow:
-        """Compare-and-set along TRANSITIONS. `fence`: only if this is the job's attempt; `sources`: only from these."""
-        allowed = {state for state, targets in TRANSITIONS.items() if to in targets}
+        """Compare-and-set along `STATES`. `fence`: only if this is the job's attempt; `sources`: only from these."""
+        allowed = {state for state, facts in STATES.items() if to in facts.becomes}
         where = [JobRow.id == job_id, JobRow.deleted_at.is_(None), JobRow.state.in_(allowed & (sources or allowed))]
         if fence is not None:
             where.append(JobRow.attempt == fence)

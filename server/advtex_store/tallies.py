@@ -10,7 +10,7 @@ from sqlalchemy import func, select
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
-from advtex_contract.jobs import JobState
+from advtex_contract.jobs import WAITING, JobState
 from advtex_store.database import Database
 from advtex_store.models import DeliveryRow, JobRow, TallyRow
 
@@ -75,7 +75,7 @@ class Tallies:
     def load(self) -> Load:
         """How much there is to do."""
         waiting = select(func.count(), func.min(JobRow.created_at)).where(
-            JobRow.state.in_((JobState.queued, JobState.preempted)), JobRow.deleted_at.is_(None)
+            JobRow.state.in_(WAITING), JobRow.deleted_at.is_(None)
         )
         with self.database.read() as session:
             count, oldest = session.execute(waiting).one()

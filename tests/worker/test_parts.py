@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 
 from advtex_contract.jobs import Progress
 from advtex_contract.options import JobOptions, Method, Preset
+from advtex_contract.stages import STAGE_LABELS
 from advtex_engine.core import config as engine
 from advtex_engine.core.monitor import STAGES
 from advtex_store.errors import StaleAttempt
@@ -177,6 +178,10 @@ def test_the_eta_counts_only_steps_of_this_attempt() -> None:
     assert tracker.view.eta_seconds == pytest.approx(90.0)
     tracker.stage(StageEvent(stage="export"))
     assert tracker.view.eta_seconds is None
+
+
+def test_the_contract_has_words_for_the_engines_stages() -> None:
+    assert tuple(STAGE_LABELS) == STAGES
 
 
 @given(st.lists(st.tuples(st.sampled_from(STAGES), st.integers(0, 1_000_000)), max_size=20))

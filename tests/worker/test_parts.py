@@ -27,7 +27,6 @@ from advtex_store.errors import StaleAttempt
 from advtex_store.queue import TASK
 from advtex_store.records import Lease
 from advtex_worker.adapt import texture_config
-from advtex_worker.child import death_sentence
 from advtex_worker.events import (
     CheckpointEvent,
     DiskFullEvent,
@@ -150,14 +149,6 @@ def test_events_survive_the_line(event: Event) -> None:
 def test_other_lines_are_no_events(line: str) -> None:
     with pytest.raises(ValueError, match="validation error"):
         parse_event(line)
-
-
-@pytest.mark.parametrize(
-    ("code", "words"),
-    [(-9, "out of memory"), (-11, "SIGSEGV"), (-15, "SIGTERM"), (3, "exit code 3"), (-50, "signal 50"), (0, "without")],
-)
-def test_a_death_is_a_sentence(code: int, words: str) -> None:
-    assert words in death_sentence(code)
 
 
 class Clock:

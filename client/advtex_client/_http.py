@@ -10,7 +10,7 @@ import httpx
 from advtex_client._calls import Call
 from advtex_client.config import ClientConfig
 from advtex_client.errors import IntegrityError
-from advtex_contract.jobs import ResultFile
+from advtex_contract.jobs import ANY_STATE_HEADER, ResultFile
 
 LIMITS = httpx.Limits(max_connections=10)
 TIMEOUT = httpx.Timeout(60.0, connect=10.0)
@@ -22,7 +22,7 @@ def base_headers(config: ClientConfig) -> dict[str, str]:
         release = version("advtex")
     except PackageNotFoundError:  # run from a source tree
         release = "0"
-    headers = {"User-Agent": f"advtex-client/{release}"}
+    headers = {"User-Agent": f"advtex-client/{release}", ANY_STATE_HEADER: "yes"}
     return headers | {"Authorization": f"Bearer {config.api_key}"} if config.api_key else headers
 
 

@@ -21,7 +21,7 @@ from advtex_client.errors import ApiError, AuthError, BusyError, ClientError, Ne
 from advtex_client.manifests import BatchItem
 from advtex_client.memory import SubmissionMemory, write_whole
 from advtex_contract.errors import ErrorCode
-from advtex_contract.jobs import WAITING, BatchView, JobSpec, JobView
+from advtex_contract.jobs import PENDING, BatchView, JobSpec, JobView
 from advtex_contract.options import JobOptions
 
 REPORT = "report.json"
@@ -100,7 +100,7 @@ def result_rows(client: Client, batch_id: str) -> Iterator[dict[str, Any]]:
 def waiting_reasons(client: Client, batch: BatchView) -> list[str]:
     """Why jobs of a batch wait, the most frequent reason first; of the newest ones, where there are many."""
     found: Counter[str] = Counter()
-    for state in sorted(WAITING):
+    for state in sorted(PENDING):
         if batch.states.get(state):
             jobs = islice(client.list_jobs(batch=batch.id, state=state), ASKED_WHY)
             found.update(job.waiting_reason for job in jobs if job.waiting_reason)

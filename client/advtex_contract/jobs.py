@@ -21,6 +21,7 @@ BatchId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{
 
 
 class JobState(StrEnum):
+    checking = "checking"
     queued = "queued"
     running = "running"
     preempted = "preempted"
@@ -50,6 +51,12 @@ class StateFacts:
 
 S = JobState
 STATES: Mapping[JobState, StateFacts] = {
+    S.checking: StateFacts(
+        "waits until its scan is checked",
+        "checking",
+        "busy",
+        becomes=frozenset({S.queued, S.rejected, S.failed, S.canceled}),
+    ),
     S.queued: StateFacts(
         "waits for a worker",
         "queued",
@@ -72,16 +79,25 @@ STATES: Mapping[JobState, StateFacts] = {
     ),
     S.succeeded: StateFacts("has its results", "succeeded", "good", terminal=True),
     S.failed: StateFacts(
-        "has ended with an error, and can be retried", "failed", "bad", becomes=frozenset({S.queued}), terminal=True
+        "has ended with an error, and can be retried",
+        "failed",
+        "bad",
+        becomes=frozenset({S.checking, S.queued}),
+        terminal=True,
     ),
     S.canceled: StateFacts(
-        "was ended by its owner, and can be retried", "canceled", becomes=frozenset({S.queued}), terminal=True
+        "was ended by its owner, and can be retried",
+        "canceled",
+        becomes=frozenset({S.checking, S.queued}),
+        terminal=True,
     ),
     S.rejected: StateFacts("has a scan that cannot be textured", "rejected", "bad", terminal=True),
 }
 TERMINAL = frozenset(state for state in STATES if STATES[state].terminal)
 WAITING = frozenset(state for state in STATES if STATES[state].waiting)
+PENDING = frozenset(JobState) - TERMINAL - {S.running}
 RETRYABLE = frozenset(state for state in TERMINAL if STATES[state].becomes)
+ANY_STATE_HEADER = "Advtex-Any-State"  # of clients that read the following; others of ours know no `checking`
 AnyState = Annotated[
     JobState | str,
     Field(union_mode="left_to_right", description="a state that is not known here is one in which the job goes on"),
@@ -165,7 +181,8 @@ class JobView(BaseModel):
 
     attempt: counts from 1; it is 0 until a worker first takes the job.
     waiting_reason: why the job still waits, in words; empty when it does not.
-    memory_bytes: what a worker must have for it, estimated from its views, texture size and preset.
+    memory_bytes: what a worker must have for it, estimated from its views, texture size and preset once the scan is
+    checked.
     retention_seconds: how long it is kept after its end; then `expires_at` is known.
     """
 

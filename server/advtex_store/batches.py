@@ -10,7 +10,7 @@ from typing import Any
 
 from sqlalchemy import Select, func, select
 
-from advtex_contract.jobs import TERMINAL, WAITING, JobState, Progress
+from advtex_contract.jobs import PENDING, TERMINAL, JobState, Progress
 from advtex_store.database import Database
 from advtex_store.errors import RecordNotFound
 from advtex_store.models import JobRow
@@ -63,7 +63,7 @@ class Batches:
                 mine.where(JobRow.state == JobState.succeeded).order_by(JobRow.id.desc()).limit(MEASURED)
             ).all()
             running = session.execute(mine.where(JobRow.state == JobState.running)).all()
-            waiting = session.scalars(mine.with_only_columns(JobRow.options).where(JobRow.state.in_(WAITING))).all()
+            waiting = session.scalars(mine.with_only_columns(JobRow.options).where(JobRow.state.in_(PENDING))).all()
         eta = remaining_seconds(
             [(o, Progress.model_validate(p)) for o, p in ended],
             [(o, Progress.model_validate(p)) for o, p in running],

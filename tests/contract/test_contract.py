@@ -76,7 +76,7 @@ def test_labels_are_one_printable_line(label: str) -> None:
 
 def test_the_table_has_all_states_and_their_ends() -> None:
     assert list(STATES) == list(JobState), "in the order in which the page lists them"
-    assert set(JobState) - TERMINAL == {JobState.queued, JobState.running, JobState.preempted}
+    assert set(JobState) - TERMINAL == {JobState.checking, JobState.queued, JobState.running, JobState.preempted}
     assert {JobState.failed, JobState.canceled} == RETRYABLE
     assert {state for state in STATES if not STATES[state].becomes} == TERMINAL - RETRYABLE
     for state, facts in STATES.items():

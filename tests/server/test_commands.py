@@ -126,6 +126,7 @@ def test_up(up: Up, tmp_path: Path, scan_zip: Path) -> None:
 
     upload = up.http.post("/v1/uploads", content=scan_zip.read_bytes()).json()["id"]
     job = up.http.post("/v1/jobs", json={"upload_id": upload}).json()
+    until(lambda: up.http.get(f"/v1/jobs/{job['id']}").json()["state"] == "queued")
     with up.http.stream("GET", f"/v1/jobs/{job['id']}/events") as response:
         next(response.iter_lines())
         children = up.children()

@@ -238,7 +238,7 @@ def test_events_are_changes_of_state_and_stage(bench: Any) -> None:
     bench.records.succeed(job, 1, [])
     events = bench.records.events(job, 0)
     told = [event.data.get("state") or event.data["stage"] for event in events]
-    assert told == ["queued", "running", "optimization", "export", "succeeded"]
+    assert told == ["checking", "queued", "running", "optimization", "export", "succeeded"]
     versions = [event.version for event in events]
     assert versions == sorted(set(versions))
     assert versions[-1] == bench.records.job(job).version

@@ -127,7 +127,7 @@ class JobBar:
 
     def show(self, job: JobView) -> None:
         progress = job.progress
-        where = progress.stage if job.state is JobState.running and progress.stage else job.state.value
+        where = progress.stage if job.state is JobState.running and progress.stage else job.state
         if job.waiting_reason:
             where += f" ({job.waiting_reason})"
         if self._bars.disable and where != self._said:

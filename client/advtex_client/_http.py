@@ -9,7 +9,7 @@ import httpx
 from advtex_client._calls import Call
 from advtex_client.config import ClientConfig
 from advtex_client.errors import IntegrityError
-from advtex_contract.jobs import ResultFile
+from advtex_contract.jobs import ANY_STATE_HEADER, ResultFile
 from advtex_scan.version import product_version
 
 LIMITS = httpx.Limits(max_connections=10)
@@ -18,7 +18,7 @@ UPLOAD_TIMEOUT = httpx.Timeout(60.0, connect=10.0, read=600.0)  # the answer com
 
 
 def base_headers(config: ClientConfig) -> dict[str, str]:
-    headers = {"User-Agent": f"advtex-client/{product_version()}"}
+    headers = {"User-Agent": f"advtex-client/{product_version()}", ANY_STATE_HEADER: "yes"}
     return headers | {"Authorization": f"Bearer {config.api_key}"} if config.api_key else headers
 
 

@@ -108,7 +108,9 @@ class AsyncClient:
         new: bool = False,
         on_bytes: OnBytes | None = None,
     ) -> JobView:
-        """Check, pack, send and queue a scan; the same scan with the same options and label gives the same job again.
+        """Check, pack and send a scan; the same scan with the same options and label gives the same job again.
+
+        The server checks it once more before it queues the job: `watch_job` and `wait_for_job` tell what came of it.
 
         Raises ScanRejectedError, with every problem found, before anything is sent. `new` makes another job.
         `retention_seconds`: how long it is kept after its end.

@@ -21,13 +21,12 @@ from advtex_client.errors import ApiError, AuthError, BusyError, ClientError, Ne
 from advtex_client.manifests import BatchItem
 from advtex_client.memory import SubmissionMemory, write_whole
 from advtex_contract.errors import ErrorCode
-from advtex_contract.jobs import BatchView, JobSpec, JobState, JobView
+from advtex_contract.jobs import PENDING, BatchView, JobSpec, JobView
 from advtex_contract.options import JobOptions
 
 REPORT = "report.json"
 AT_ONCE = 4  # requests for scans by reference; scans that are sent go one after the other
 ASKED_WHY = 100  # jobs that are asked why they wait
-WAITING = (JobState.queued, JobState.preempted)
 FULL_SECONDS = 15.0  # between looks whether a quota has room again
 
 OnFull = Callable[[ClientError], None]
@@ -89,7 +88,7 @@ def submit_batch(
 def result_rows(client: Client, batch_id: str) -> Iterator[dict[str, Any]]:
     """Yield a batch's jobs, sorted by label, for a table: what each came to, and its scores where there are any."""
     for job in sorted(client.list_jobs(batch=batch_id), key=lambda job: (job.label, job.id)):
-        row: dict[str, Any] = {"job": job.id, "label": job.label, "state": job.state.value, "steps": job.progress.steps}
+        row: dict[str, Any] = {"job": job.id, "label": job.label, "state": job.state, "steps": job.progress.steps}
         row["seconds"] = round(sum(job.progress.stage_seconds.values()), 1)
         if job.error is not None:
             row["error"] = job.error.message
@@ -101,7 +100,7 @@ def result_rows(client: Client, batch_id: str) -> Iterator[dict[str, Any]]:
 def waiting_reasons(client: Client, batch: BatchView) -> list[str]:
     """Return why jobs of a batch wait, the most frequent reason first; of the newest ones, where there are many."""
     found: Counter[str] = Counter()
-    for state in WAITING:
+    for state in sorted(PENDING):
         if batch.states.get(state):
             jobs = islice(client.list_jobs(batch=batch.id, state=state), ASKED_WHY)
             found.update(job.waiting_reason for job in jobs if job.waiting_reason)

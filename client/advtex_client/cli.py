@@ -40,12 +40,10 @@ from advtex_client.client import Client
 from advtex_client.deep import deep_lines, deep_report
 from advtex_client.doctor import examine
 from advtex_client.errors import ScanRejectedError
-from advtex_contract.jobs import TERMINAL, JobState, JobView
+from advtex_contract.jobs import RETRYABLE, TERMINAL, JobState, JobView
 from advtex_contract.options import Method, Preset
 from advtex_scan.check import check_scan
 from advtex_scan.version import product_version
-
-RETRYABLE = (JobState.failed, JobState.canceled)
 
 app = typer.Typer(
     help="Texture RGB-D scans on an advtex server.",
@@ -146,11 +144,13 @@ def submit(
                     new=new,
                     on_bytes=bar.upload,
                 )
-            for line in finding_lines(job.warnings):
-                display.note(line)
-            if job.state in TERMINAL:
+            if job.state is JobState.checking:
+                job = _checked(client, display, job.id, timeout)
+            elif job.state in TERMINAL:
                 again = f"`advtex-client retry {job.id}` or " if job.state in RETRYABLE else ""
                 display.note(f"this scan was submitted before: job {job.id} {job.state}; {again}--new does it again")
+            for line in finding_lines(job.warnings):
+                display.note(line)
             if not wait and output is None:
                 display.data(job, job.id)
                 return
@@ -253,6 +253,16 @@ def main() -> None:
     app()
 
 
+def _checked(client: Client, display: Display, job_id: str, timeout: float | None) -> JobView:
+    """The job once the server has checked its scan; raises how it ended if that was its end."""
+    with display.job_bar() as bar:
+        for job in client.watch_job(job_id, timeout=timeout, on_trouble=bar.trouble):
+            bar.show(job)
+            if job.state is not JobState.checking:
+                break
+    return _ended_well(display, job) if job.state in TERMINAL else job
+
+
 def _finish(
     client: Client,
     display: Display,
@@ -269,14 +279,19 @@ def _finish(
             if every_change:
                 display.data(view, "")
             last = view
-    if last.state is not JobState.succeeded and display.as_json and not every_change:
-        display.data(last, "")  # how it ended, for programs
-    ensure_succeeded(last)
+    _ended_well(display, last, told=every_change)
     if output is not None:
         paths = _download(client, display, last, output, None)
         display.data({"job": last.model_dump(mode="json"), "files": [str(path) for path in paths]}, _lines(paths))
     elif not every_change:
         display.data(last, last.id)
+
+
+def _ended_well(display: Display, job: JobView, told: bool = False) -> JobView:
+    """The job if it succeeded; else how it ended is raised, and before that printed for programs, unless it was."""
+    if job.state is not JobState.succeeded and display.as_json and not told:
+        display.data(job, "")
+    return ensure_succeeded(job)
 
 
 def _download(client: Client, display: Display, job: JobView, output: Path, names: list[str] | None) -> list[Path]:

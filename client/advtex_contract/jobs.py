@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints, model_validator
 
@@ -20,10 +21,7 @@ BatchId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{
 
 
 class JobState(StrEnum):
-    """`queued` waits for a worker, `running` has one, `preempted` had to give its worker back and waits to go on, the
-    last four are final. `uploading` is reserved: a job is made of a finished upload, so none is ever in it."""
-
-    uploading = "uploading"
+    checking = "checking"
     queued = "queued"
     running = "running"
     preempted = "preempted"
@@ -33,7 +31,78 @@ class JobState(StrEnum):
     rejected = "rejected"
 
 
-TERMINAL = frozenset({JobState.succeeded, JobState.failed, JobState.canceled, JobState.rejected})
+@dataclass(frozen=True, slots=True)
+class StateFacts:
+    """What is true of every job in one state.
+
+    meaning: continues the sentence that begins with the state's name.
+    label, tone: what the page shows for it, and in which of its colors.
+    becomes: the states that may follow.
+    waiting: for a worker; any may take the job. terminal: it has ended; only a retry changes that.
+    """
+
+    meaning: str
+    label: str
+    tone: Literal["plain", "busy", "good", "bad", "warn"] = "plain"
+    becomes: frozenset[JobState] = frozenset()
+    waiting: bool = False
+    terminal: bool = False
+
+
+S = JobState
+STATES: Mapping[JobState, StateFacts] = {
+    S.checking: StateFacts(
+        "waits until its scan is checked",
+        "checking",
+        "busy",
+        becomes=frozenset({S.queued, S.rejected, S.failed, S.canceled}),
+    ),
+    S.queued: StateFacts(
+        "waits for a worker",
+        "queued",
+        # A waiting job can succeed: a late attempt's manifest is adopted instead of doing the work again.
+        becomes=frozenset({S.running, S.succeeded, S.canceled}),
+        waiting=True,
+    ),
+    S.running: StateFacts(
+        "has a worker",
+        "running",
+        "busy",
+        becomes=frozenset({S.queued, S.preempted, S.succeeded, S.failed, S.canceled, S.rejected}),
+    ),
+    S.preempted: StateFacts(
+        "had to give its worker back and waits to go on",
+        "preempted",
+        "warn",
+        becomes=frozenset({S.running, S.succeeded, S.canceled}),
+        waiting=True,
+    ),
+    S.succeeded: StateFacts("has its results", "succeeded", "good", terminal=True),
+    S.failed: StateFacts(
+        "has ended with an error, and can be retried",
+        "failed",
+        "bad",
+        becomes=frozenset({S.checking, S.queued}),
+        terminal=True,
+    ),
+    S.canceled: StateFacts(
+        "was ended by its owner, and can be retried",
+        "canceled",
+        becomes=frozenset({S.checking, S.queued}),
+        terminal=True,
+    ),
+    S.rejected: StateFacts("has a scan that cannot be textured", "rejected", "bad", terminal=True),
+}
+TERMINAL = frozenset(state for state in STATES if STATES[state].terminal)
+WAITING = frozenset(state for state in STATES if STATES[state].waiting)
+PENDING = frozenset(JobState) - TERMINAL - {S.running}
+RETRYABLE = frozenset(state for state in TERMINAL if STATES[state].becomes)
+ANY_STATE_HEADER = "Advtex-Any-State"  # of clients that read the following; others of ours know no `checking`
+AnyState = Annotated[
+    JobState | str,
+    Field(union_mode="left_to_right", description="a state that is not known here is one in which the job goes on"),
+]
+JobState.__doc__ = f"A job that is {'; '.join(f'`{state}` {STATES[state].meaning}' for state in STATES)}."
 
 
 class JobSpec(BaseModel):
@@ -112,12 +181,13 @@ class JobView(BaseModel):
 
     attempt: counts from 1; it is 0 until a worker first takes the job.
     waiting_reason: why the job still waits, in words; empty when it does not.
-    memory_bytes: what a worker must have for it, estimated from its views, texture size and preset.
+    memory_bytes: what a worker must have for it, estimated from its views, texture size and preset once the scan is
+    checked.
     retention_seconds: how long it is kept after its end; then `expires_at` is known.
     """
 
     id: str
-    state: JobState
+    state: AnyState
     label: str = ""
     upload_id: str
     source: str | None = None
@@ -153,7 +223,7 @@ class BatchView(BaseModel):
 
     id: str
     jobs: int
-    states: dict[JobState, int]
+    states: dict[AnyState, int]
     finished: bool
     eta_seconds: float | None = None
     created_at: datetime

@@ -6,9 +6,7 @@ from datetime import datetime
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from advtex_contract.jobs import TERMINAL, JobState
-
-EVENTS = frozenset(JobState) - {JobState.uploading}
+from advtex_contract.jobs import TERMINAL, AnyState, JobState
 
 
 class WebhookSpec(BaseModel):
@@ -29,7 +27,7 @@ class WebhookView(BaseModel):
 
     id: str
     url: str
-    events: list[JobState]
+    events: list[AnyState]
     secret: str | None = None
     failures: int = 0
     last_error: str = ""
@@ -54,7 +52,7 @@ class JobEventData(BaseModel):
     """The job at the time of the event; `GET /v1/jobs/{id}` has all of it."""
 
     id: str
-    state: JobState
+    state: AnyState
     attempt: int
     label: str
     error: JobEventError | None

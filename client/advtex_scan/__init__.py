@@ -38,6 +38,7 @@ from advtex_scan.manifest import (
     VideoFrame,
 )
 from advtex_scan.mesh import MeshFacts
+from advtex_scan.remote import open_remote
 
 __all__ = [
     "IDENTITY",
@@ -67,6 +68,7 @@ __all__ = [
     "UpAxis",
     "VideoFrame",
     "check_scan",
+    "open_remote",
     "open_scan",
     "read_image_header",
     "read_scan",

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from advtex_scan._source import FileSource
+from advtex_scan._source import ByteSource
 from advtex_scan.errors import ArchiveError, Finding
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def damaged(name: str, what: str) -> ArchiveError:
 class RangeReader:
     """Reads ranges of the members of one file. Safe to use from several threads at once."""
 
-    def __init__(self, source: FileSource) -> None:
+    def __init__(self, source: ByteSource) -> None:
         self._source = source
         self._lock = threading.Lock()
         self._checkpoints: defaultdict[str, list[_State]] = defaultdict(list)
@@ -112,7 +112,7 @@ class RangeReader:
 class MemberStream(io.RawIOBase):
     """One pass over a member from its first byte; its length and CRC are checked when the end is reached."""
 
-    def __init__(self, source: FileSource, extent: Extent) -> None:
+    def __init__(self, source: ByteSource, extent: Extent) -> None:
         super().__init__()
         self._source = source
         self._extent = extent
@@ -144,14 +144,14 @@ class MemberStream(io.RawIOBase):
             raise damaged(self._extent.name, "its checksum is wrong")
 
 
-def _stored(source: FileSource, extent: Extent, offset: int, length: int) -> bytes:
+def _stored(source: ByteSource, extent: Extent, offset: int, length: int) -> bytes:
     data = source.read(length, extent.start + offset)
     if len(data) != length:
         raise damaged(extent.name, "the file ends before this member does")
     return data
 
 
-def _next_input(source: FileSource, extent: Extent, state: _State) -> bytes:
+def _next_input(source: ByteSource, extent: Extent, state: _State) -> bytes:
     """Return what the inflater left over, else the next stored bytes; empty at the member's end."""
     if state.inflater.unconsumed_tail:
         return state.inflater.unconsumed_tail
@@ -160,7 +160,7 @@ def _next_input(source: FileSource, extent: Extent, state: _State) -> bytes:
     return piece
 
 
-def _inflate(source: FileSource, extent: Extent, state: _State, length: int) -> Iterator[bytes]:
+def _inflate(source: ByteSource, extent: Extent, state: _State, length: int) -> Iterator[bytes]:
     """Advance `state` by `length` bytes of output, in pieces of at most OUTPUT_CHUNK."""
     while length > 0:
         data = _next_input(source, extent, state)
@@ -176,7 +176,7 @@ def _inflate(source: FileSource, extent: Extent, state: _State, length: int) -> 
             raise damaged(extent.name, f"inflates to {state.position} bytes, not to the {extent.size} it claims")
 
 
-def _holds_more(source: FileSource, extent: Extent, state: _State) -> bool:
+def _holds_more(source: ByteSource, extent: Extent, state: _State) -> bool:
     try:
         while not state.inflater.eof:
             data = _next_input(source, extent, state)

@@ -1,14 +1,29 @@
-"""Reads at positions of one file, from several threads, on every platform (`os.pread` is missing on Windows)."""
+"""Bytes at positions of one file."""
 
 from __future__ import annotations
 
 import os
 import threading
 from pathlib import Path
+from typing import Protocol
+
+
+class ByteSource(Protocol):
+    """A file without a position of its own. Reading after `close` raises ValueError."""
+
+    @property
+    def size(self) -> int:
+        """Bytes that it holds."""
+
+    def read(self, length: int, offset: int) -> bytes:
+        """`length` bytes from `offset`, fewer only at the end of the file."""
+
+    def close(self) -> None:
+        """Close the file."""
 
 
 class FileSource:
-    """An open file without a position of its own. Reading after `close` raises ValueError."""
+    """A file of this machine, read from several threads, on every platform (`os.pread` is missing on Windows)."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("rb", buffering=0)

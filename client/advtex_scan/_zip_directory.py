@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from advtex_scan._inflate import Extent, damaged
 from advtex_scan._names import is_junk, is_nested_archive, unsafe_reason
-from advtex_scan._source import FileSource
+from advtex_scan._source import ByteSource
 from advtex_scan.errors import ArchiveError, Finding, Findings, LimitError, ScanFormatError, UnsafeArchiveError
 
 END = struct.Struct("<4s4H2LH")  # end of central directory
@@ -55,7 +55,7 @@ class _Entry:
     is_folder: bool
 
 
-def read_directory(source: FileSource, label: str, limits: ArchiveLimits) -> dict[str, Extent]:
+def read_directory(source: ByteSource, label: str, limits: ArchiveLimits) -> dict[str, Extent]:
     """Return all files of the zip by name, without folders and operating systems' junk.
 
     Raises ArchiveError with every problem that was found in the directory.
@@ -101,14 +101,14 @@ def _not_a_zip(label: str, what: str) -> ArchiveError:
     )
 
 
-def _exactly(source: FileSource, label: str, length: int, offset: int) -> bytes:
+def _exactly(source: ByteSource, label: str, length: int, offset: int) -> bytes:
     data = source.read(length, offset) if offset >= 0 else b""
     if len(data) != length:
         raise _not_a_zip(label, "is truncated or no zip: its directory points outside the file")
     return data
 
 
-def _find_directory(source: FileSource, label: str) -> tuple[int, int, int]:
+def _find_directory(source: ByteSource, label: str) -> tuple[int, int, int]:
     """Return the start, size in bytes and stated number of entries of the central directory."""
     end = source.size
     tail_start = max(0, end - END.size - U16)
@@ -135,7 +135,7 @@ def _find_directory(source: FileSource, label: str) -> tuple[int, int, int]:
     return start, size, count
 
 
-def _entries(source: FileSource, label: str, start: int, size: int) -> Iterator[_Entry]:
+def _entries(source: ByteSource, label: str, start: int, size: int) -> Iterator[_Entry]:
     data = _exactly(source, label, size, start)
     at = 0
     while at < size:
@@ -215,7 +215,7 @@ def _check_entries(entries: list[_Entry], limits: ArchiveLimits, problems: Findi
         problems.error("archive_too_large", "", message, "split the scan")
 
 
-def _locate(source: FileSource, directory: int, entries: list[_Entry], problems: Findings) -> dict[str, Extent]:
+def _locate(source: ByteSource, directory: int, entries: list[_Entry], problems: Findings) -> dict[str, Extent]:
     """Follow each entry to its bytes; they must lie between its own header and the next one."""
     extents: dict[str, Extent] = {}
     ordered = sorted(entries, key=lambda entry: entry.header)

@@ -1,5 +1,7 @@
 """A scan's files, from a folder, a zip or a lone `.sens`, read as streams; nothing is ever unpacked to disk.
 
+What lies elsewhere and can be read by ranges is opened by `open_remote` (`remote.py`).
+
     with open_scan("scan.zip") as archive:
         archive.names()                       # "color/0.jpg", ...: sorted, below the one top folder if there is one
         archive.read("color/0.jpg", 1 << 20)  # bytes, at most so many
@@ -15,16 +17,20 @@ import os
 import stat
 import zlib
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Self, cast
+from typing import TYPE_CHECKING, BinaryIO, Self, cast
 
 from advtex_scan._inflate import Extent, MemberStream, RangeReader
 from advtex_scan._names import MAX_NAME, common_folder, is_junk, is_nested_archive, unsafe_reason
-from advtex_scan._source import FileSource
+from advtex_scan._source import ByteSource, FileSource
 from advtex_scan._zip_directory import ArchiveLimits, raise_errors, read_directory, too_many_entries
 from advtex_scan.errors import ArchiveError, Finding, Findings, LimitError
 from advtex_scan.manifest import ByteRange, FileRef
+
+if TYPE_CHECKING:
+    from _typeshed import WriteableBuffer
 
 READ_LIMIT = 256 << 20  # bytes that `read` returns at most unless told otherwise
 STREAM_MAGIC = b"\x04\0\0\0"  # ScanNet's `.sens`, version 4: told by its content, for servers rename what they store
@@ -81,7 +87,7 @@ class ScanArchive(ABC):
         with self.open(name) as stream:
             data = stream.read(length)
             if len(data) != length or stream.read(1):  # a zip member checks its sum at its end
-                raise _changed(name)
+                raise changed(name)
         return data
 
     def head(self, ref: FileRef, length: int) -> bytes:
@@ -135,25 +141,28 @@ def open_scan(path: str | os.PathLike[str], limits: ArchiveLimits | None = None)
     if location.is_dir():
         return _FolderArchive(location, limits)
     if location.is_file():
-        with location.open("rb") as file:
-            is_stream = file.read(len(STREAM_MAGIC)) == STREAM_MAGIC
-        return _StreamArchive(location, limits) if is_stream else _ZipArchive(location, limits)
+        return lone_file(FileSource(location), location, limits)
     raise ArchiveError(
         Finding("error", "not_found", location.name, "is neither a folder nor a file", "give the path of a scan")
     )
 
 
+def lone_file(source: ByteSource, path: Path, limits: ArchiveLimits) -> ScanArchive:
+    """A scan that is one file, a zip or a `.sens`. path: names it in findings."""
+    try:
+        is_stream = source.read(len(STREAM_MAGIC), 0) == STREAM_MAGIC
+        return _StreamArchive(source, path, limits) if is_stream else _ZipArchive(source, path, limits)
+    except BaseException:
+        source.close()
+        raise
+
+
 class _ZipArchive(ScanArchive):
-    def __init__(self, path: Path, limits: ArchiveLimits) -> None:
-        self._source = FileSource(path)
-        try:
-            extents = read_directory(self._source, path.name, limits)
-        except BaseException:
-            self.close()
-            raise
-        self._extents: dict[str, Extent] = extents
+    def __init__(self, source: ByteSource, path: Path, limits: ArchiveLimits) -> None:
+        self._source = source
+        self._extents: dict[str, Extent] = read_directory(source, path.name, limits)
         self._reader = RangeReader(self._source)
-        super().__init__(path, {name: extent.size for name, extent in extents.items()})
+        super().__init__(path, {name: extent.size for name, extent in self._extents.items()})
 
     def close(self) -> None:
         self._source.close()
@@ -171,33 +180,47 @@ class _ZipArchive(ScanArchive):
 class _StreamArchive(ScanArchive):
     """A scan that is one file, under STREAM_NAME."""
 
-    def __init__(self, path: Path, limits: ArchiveLimits) -> None:
-        self._source = FileSource(path)
-        if self._source.size > limits.member_bytes:
-            self.close()
+    def __init__(self, source: ByteSource, path: Path, limits: ArchiveLimits) -> None:
+        self._source = source
+        if source.size > limits.member_bytes:
             message = f"is larger than {limits.member_bytes} bytes"
             raise ArchiveError(Finding("error", "member_too_large", path.name, message, "split the scan"))
-        super().__init__(path, {STREAM_NAME: self._source.size})
+        super().__init__(path, {STREAM_NAME: source.size})
 
     def close(self) -> None:
         self._source.close()
 
     def _stamp(self, name: str) -> int:
-        checksum = 0
-        with self.open(name) as stream:
-            while data := stream.read(1 << 20):
-                checksum = zlib.crc32(data, checksum)
-        return checksum
+        return checksum(self._stream(name))
 
     def _stream(self, name: str) -> io.RawIOBase:
         assert name == STREAM_NAME
-        return io.FileIO(self.path, "rb")
+        return SourceStream(self._source)
 
     def _range(self, name: str, offset: int, length: int) -> bytes:
         data = self._source.read(length, offset)
         if len(data) != length:
-            raise _changed(name)
+            raise changed(name)
         return data
+
+
+class SourceStream(io.RawIOBase):
+    """One pass over a file from its first byte."""
+
+    def __init__(self, source: ByteSource) -> None:
+        super().__init__()
+        self._source = source
+        self._position = 0
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: WriteableBuffer, /) -> int:
+        view = memoryview(buffer).cast("B")
+        data = self._source.read(len(view), self._position)
+        view[: len(data)] = data
+        self._position += len(data)
+        return len(data)
 
 
 class _FolderArchive(ScanArchive):
@@ -207,9 +230,7 @@ class _FolderArchive(ScanArchive):
         sizes: dict[str, int] = {}
         for name, size in _walk(self._root, path.name, limits, problems):
             sizes[name] = size
-        if sum(sizes.values()) > limits.total_bytes:
-            message = f"holds more than {limits.total_bytes} bytes"
-            problems.error("archive_too_large", path.name, message, "split the scan")
+        check_total(path.name, sizes, limits, problems)
         raise_errors(problems)
         super().__init__(path, sizes)
 
@@ -230,7 +251,7 @@ class _FolderArchive(ScanArchive):
             stream.seek(offset)
             data = stream.read(length)
         if len(data) != length:
-            raise _changed(name)
+            raise changed(name)
         return data
 
     def _open(self, name: str) -> io.FileIO:
@@ -248,7 +269,8 @@ def _unreadable(name: str, error: OSError) -> ArchiveError:
     return ArchiveError(Finding("error", "unreadable_file", name, message, "check its permissions"))
 
 
-def _changed(name: str) -> ArchiveError:
+def changed(name: str) -> ArchiveError:
+    """The error for a file that is no longer as long as it was."""
     message = "changed its length while it was read"
     return ArchiveError(Finding("error", "truncated_file", name, message, "wait until the scan is written"))
 
@@ -286,12 +308,7 @@ def _unreadable_folder(error: OSError) -> None:
 
 
 def _checked_size(root: Path, path: Path, name: str, limits: ArchiveLimits, problems: Findings) -> int:
-    shown = repr(name)[1:-1][:200]
-    reason = unsafe_reason(name)
-    if reason:
-        problems.error("unsafe_name", shown, reason, "use plain relative names")
-    if is_nested_archive(name):
-        problems.error("nested_archive", shown, "is an archive inside the scan", "unpack it, or leave it out")
+    shown = check_name(name, problems)
     try:
         if path.is_symlink() and not path.resolve(strict=True).is_relative_to(root):
             problems.add(_leaves(shown))
@@ -302,7 +319,38 @@ def _checked_size(root: Path, path: Path, name: str, limits: ArchiveLimits, prob
         return 0
     if not stat.S_ISREG(status.st_mode):
         problems.error("link_or_device", shown, "is a linked folder or special file", "replace it by plain files")
-    if status.st_size > limits.member_bytes:
+    check_size(shown, status.st_size, limits, problems)
+    return status.st_size
+
+
+def check_name(name: str, problems: Findings) -> str:
+    """Of a folder's file. -> the name as findings show it"""
+    shown = repr(name)[1:-1][:200]
+    reason = unsafe_reason(name)
+    if reason:
+        problems.error("unsafe_name", shown, reason, "use plain relative names")
+    if is_nested_archive(name):
+        problems.error("nested_archive", shown, "is an archive inside the scan", "unpack it, or leave it out")
+    return shown
+
+
+def check_size(shown: str, size: int, limits: ArchiveLimits, problems: Findings) -> None:
+    """Of a folder's file."""
+    if size > limits.member_bytes:
         message = f"is larger than {limits.member_bytes} bytes"
         problems.error("member_too_large", shown, message, "leave it out or split the scan")
-    return status.st_size
+
+
+def check_total(label: str, sizes: Mapping[str, int], limits: ArchiveLimits, problems: Findings) -> None:
+    """Of all files of a folder."""
+    if sum(sizes.values()) > limits.total_bytes:
+        problems.error("archive_too_large", label, f"holds more than {limits.total_bytes} bytes", "split the scan")
+
+
+def checksum(stream: io.RawIOBase) -> int:
+    """Of all bytes of a stream, which is closed."""
+    total = 0
+    with stream:
+        while data := stream.read(1 << 20):
+            total = zlib.crc32(data, total)
+    return total

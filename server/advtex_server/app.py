@@ -1,4 +1,4 @@
-"""The application: routes around one `Service`, with the dispatcher beside them."""
+"""The application: routes around one `Service`, with dispatcher and checker beside them."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ from advtex_server import errors
 from advtex_server.access import AccessMiddleware
 from advtex_server.bodies import OpenBodies
 from advtex_server.browsers import BrowserHeadersMiddleware, Guests
+from advtex_server.checking import Checker
 from advtex_server.deliveries import Deliverer
 from advtex_server.dispatch import Dispatcher
 from advtex_server.doorkeeper import Doorkeeper
 from advtex_server.events import Lookout
 from advtex_server.intake import Intake
 from advtex_server.metrics import Metrics, MetricsMiddleware
+from advtex_server.older_clients import OlderClientsMiddleware
 from advtex_server.refusal import ANYWHERE
 from advtex_server.routes import batches, health, jobs, pages, uploads, webhooks
 from advtex_server.service import Service
@@ -36,6 +38,7 @@ def create_app(settings: ServerSettings) -> FastAPI:
     """
     store = open_store(settings)
     dispatcher = Dispatcher(store, settings)
+    checker = Checker(store, settings, dispatcher.wake)
     deliverer = Deliverer(store.webhooks, settings)
     metrics = Metrics(store)
 
@@ -43,13 +46,19 @@ def create_app(settings: ServerSettings) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         await asyncio.to_thread(upgrade_database, settings.database)
         tasks = [asyncio.create_task(dispatcher.run()), asyncio.create_task(deliverer.run())]
+        checker.start()
         yield
         app.state.stopping.set()
         for task in tasks:
             task.cancel()
             with suppress(asyncio.CancelledError):
                 await task
+        await asyncio.to_thread(checker.stop)
         store.close()
+
+    def wake() -> None:
+        checker.wake()
+        dispatcher.wake()
 
     app = FastAPI(
         title="advtex",
@@ -60,7 +69,7 @@ def create_app(settings: ServerSettings) -> FastAPI:
         docs_url=None,  # their pages load scripts from elsewhere
         redoc_url=None,
     )
-    app.state.service = Service(store, settings, dispatcher.wake)
+    app.state.service = Service(store, settings, wake)
     app.state.webhooks = WebhookService(store.webhooks, deliverer.rules)
     app.state.metrics = metrics
     app.state.stopping = asyncio.Event()
@@ -72,6 +81,7 @@ def create_app(settings: ServerSettings) -> FastAPI:
     guests = Guests(store.sessions)
     app.state.doorkeeper, app.state.guests = doorkeeper, guests
     app.add_middleware(AccessMiddleware, doorkeeper=doorkeeper, guests=guests, max_body_bytes=settings.max_body_bytes)
+    app.add_middleware(OlderClientsMiddleware)
     app.add_middleware(TusMiddleware)
     app.add_middleware(MetricsMiddleware, metrics=metrics)
     app.add_middleware(BrowserHeadersMiddleware)

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 import structlog
 
 from advtex_contract.jobs import TERMINAL, BatchPage, BatchView, JobState
+from advtex_server.older_clients import told_batch
 from advtex_store.accounts import Caller
 from advtex_store.batches import BatchSummary
 from advtex_store.errors import IllegalTransition, RecordNotFound
@@ -25,11 +26,11 @@ class BatchService:
         self.wake = wake
 
     def view(self, owner: str, batch_id: str) -> BatchView:
-        return batch_view(self.store.batches.batch(owner, batch_id))
+        return told_batch(batch_view(self.store.batches.batch(owner, batch_id)))
 
     def page(self, owner: str, cursor: str | None, limit: int) -> BatchPage:
         found, following = self.store.batches.batches(owner, cursor, limit)
-        return BatchPage(batches=[batch_view(batch) for batch in found], next_cursor=following)
+        return BatchPage(batches=[told_batch(batch_view(batch)) for batch in found], next_cursor=following)
 
     def cancel(self, owner: str, batch_id: str) -> BatchView:
         self.store.batches.batch(owner, batch_id)

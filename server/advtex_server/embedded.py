@@ -16,9 +16,9 @@ from pathlib import Path
 
 import redis
 
-from advtex_server.children import Child
 from advtex_store.accounts import Accounts
 from advtex_store.secrecy import public_environment
+from advtex_store.supervision import Supervised
 
 START_SECONDS = 20.0
 LOWEST_PORT, LOWEST_OUTGOING_PORT = 20_000, 32_768
@@ -57,7 +57,7 @@ class EmbeddedRedis:
         self.url = f"redis://127.0.0.1:{self.port}/0"
         environment = public_environment(os.environ)
         # The configuration goes through stdin: on the command line everybody could read the password.
-        self.child = Child("redis", [redis_binary(), "-"], environment, stdin=self._configuration, stop_seconds=15)
+        self.child = Supervised("redis", [redis_binary(), "-"], environment, stdin=self._configuration, stop_seconds=15)
 
     def start(self) -> None:
         """Until it answers; SetupError. An append-only file that it cannot read any more is moved aside: what was in it

@@ -13,7 +13,7 @@ from collections.abc import AsyncIterator
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.concurrency import run_in_threadpool
 
-from advtex_contract.jobs import TERMINAL, JobState
+from advtex_contract.jobs import TERMINAL
 from advtex_server.service import Service, job_view
 from advtex_store.errors import RecordNotFound
 from advtex_store.models import EventRow, JobRow
@@ -80,7 +80,7 @@ async def stream_events(
             yield "".join(_message(e.data["kind"], e.version, json.dumps(e.data)) for e in _until(recorded, row))
             yield message
             seen, said, spoken = max(seen, row.version), message, time.monotonic()
-        if JobState(row.state) in TERMINAL:
+        if row.state in TERMINAL:
             return
         if time.monotonic() - spoken > PING_SECONDS:
             yield ": ping\n\n"

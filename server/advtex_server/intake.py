@@ -119,7 +119,7 @@ class Intake:
             log.warning("upload not removed yet", upload=upload_id, error=str(error))
 
     def _check_room(self, size: int, expected: int) -> None:
-        # Bytes for an object storage do not stay on this disk; a scan passes it once, when it is checked.
+        # Bytes for an object storage do not stay on this disk.
         promised = expected if isinstance(self.store.blobs, FolderBlobs) else 0
         if self.store.blobs.free_bytes() - promised - size < self.settings.disk_reserve_bytes:
             raise ApiError(ErrorCode.insufficient_storage, f"no room for {size} bytes on the server's disk")

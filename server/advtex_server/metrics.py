@@ -12,8 +12,7 @@ from redis import RedisError
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from advtex_contract.jobs import JobState
-from advtex_store.records import WAITING
+from advtex_contract.jobs import WAITING, JobState
 from advtex_store.store import Store
 from advtex_store.tallies import ATTEMPTS, FAILURES, JOBS, STAGES
 

@@ -11,7 +11,6 @@ from pydantic import BaseModel
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.concurrency import run_in_threadpool
 
-from advtex_contract.jobs import JobState
 from advtex_contract.options import Method, Preset
 from advtex_server.events import PING_SECONDS
 from advtex_store.models import JobRow
@@ -26,7 +25,7 @@ class JobSummary(BaseModel):
     """One line of the list. problem: why it failed or was rejected, in a sentence."""
 
     id: str
-    state: JobState
+    state: str
     label: str
     batch: str | None
     preset: Preset
@@ -47,7 +46,7 @@ def job_summary(row: JobRow) -> JobSummary:
     progress = row.progress
     return JobSummary(
         id=row.id,
-        state=JobState(row.state),
+        state=row.state,
         label=row.label,
         batch=row.batch,
         preset=row.options["preset"],

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-import tempfile
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
-from pathlib import Path
 from urllib.parse import quote
 
 import structlog
-from sqlalchemy.exc import SQLAlchemyError
 
 from advtex_contract.errors import ErrorCode, ErrorDetail
 from advtex_contract.health import KeyView
 from advtex_contract.jobs import (
+    TERMINAL,
+    WAITING,
     JobError,
     JobPage,
     JobSpec,
@@ -29,28 +26,27 @@ from advtex_contract.jobs import (
 )
 from advtex_contract.live import LiveImage, LiveRecord, LiveView
 from advtex_contract.options import JobOptions
-from advtex_scan.check import check_scan
 from advtex_server.batches import BatchService
+from advtex_server.older_clients import told
 from advtex_server.refusal import ApiError
 from advtex_server.settings import ServerSettings
 from advtex_store import keys
 from advtex_store.accounts import Caller
-from advtex_store.blobs import FolderBlobs
-from advtex_store.errors import BlobNotFound, ReferenceRefused, StoreError
+from advtex_store.errors import BlobNotFound, ReferenceRefused
 from advtex_store.models import JobRow
-from advtex_store.needs import needed_memory
-from advtex_store.records import WAITING
 from advtex_store.results import StoredFile
 from advtex_store.store import Store
-from advtex_store.submissions import HOLD_SECONDS, JobFilter, Reservation
+from advtex_store.submissions import JobFilter, Reservation
 
+IN_CHECK = "its scan is being checked"
 IN_LINE = "a worker takes it when its turn comes"
+REASONS: Mapping[str, str] = {JobState.checking: IN_CHECK, **dict.fromkeys(WAITING, IN_LINE)}  # the usual ones
 
 log = structlog.get_logger("advtex.server")
 
 
 class Service:
-    """What a caller can do. `wake` is called when a job has been queued."""
+    """What a caller can do. `wake` is called when there is a scan to check, or a job for the workers."""
 
     def __init__(self, store: Store, settings: ServerSettings, wake: Callable[[], None] = lambda: None) -> None:
         self.store = store
@@ -80,7 +76,7 @@ class Service:
     # -- jobs -----------------------------------------------------------------------------------------------------
 
     def create_job(self, caller: Caller, spec: JobSpec, token: str | None) -> tuple[JobView, bool]:
-        """Check the scan and queue the job, or record it as rejected. -> the job, and whether it is new."""
+        """A job whose scan is checked next. -> the job, and whether it is new."""
         owner, most = caller.owner, self.settings.max_retention_seconds
         if spec.retention_seconds is not None and spec.retention_seconds > most:
             raise ApiError(ErrorCode.bad_request, f"retention_seconds: jobs are kept for {most} s at most", status=422)
@@ -90,21 +86,23 @@ class Service:
             if isinstance(held, JobRow):
                 if held.deleted_at is not None:
                     raise ApiError(ErrorCode.conflict, "the job of this idempotency key was deleted; use a new key")
-                return job_view(held), False
+                return told(job_view(held)), False
             reservation = held
         try:
-            with self._holding(reservation):
-                row = self._checked_job(caller, spec, reservation)
+            self._look(owner, spec)
+            row = self.store.submissions.create_job(
+                owner, spec, reservation=reservation, max_active_jobs=caller.max_active_jobs
+            )
         except BaseException:
             if reservation is not None:
                 self.store.submissions.release(reservation)
             raise
-        log.info("job created", job=row.id, state=row.state, upload=row.upload_id)
+        log.info("job created", job=row.id, upload=row.upload_id)
         self.wake()
-        return job_view(row), True
+        return told(job_view(row)), True
 
     def job(self, owner: str, job_id: str) -> JobView:
-        return job_view(self.newest(owner, job_id))
+        return told(job_view(self.newest(owner, job_id)))
 
     def newest(self, owner: str, job_id: str) -> JobRow:
         """The row with the progress of this moment."""
@@ -115,18 +113,18 @@ class Service:
     def jobs(self, owner: str, wanted: JobFilter, cursor: str | None, limit: int) -> JobPage:
         rows, following = self.store.submissions.list_jobs(owner, wanted, cursor=cursor, limit=limit)
         self.store.live_progress.show(rows)
-        return JobPage(jobs=[job_view(row) for row in rows], next_cursor=following)
+        return JobPage(jobs=[told(job_view(row)) for row in rows], next_cursor=following)
 
     def cancel(self, owner: str, job_id: str) -> JobView:
-        view = job_view(self.store.records.cancel(job_id, owner))
+        view = told(job_view(self.store.records.cancel(job_id, owner)))
         log.info("cancel asked", job=job_id, state=view.state)
         return view
 
     def retry(self, caller: Caller, job_id: str) -> JobView:
-        view = job_view(self.store.records.retry(job_id, caller.owner, max_active_jobs=caller.max_active_jobs))
+        row = self.store.records.retry(job_id, caller.owner, max_active_jobs=caller.max_active_jobs)
         log.info("retry", job=job_id)
         self.wake()
-        return view
+        return told(job_view(row))
 
     def delete(self, owner: str, job_id: str) -> None:
         self.store.records.delete(job_id, owner)
@@ -144,7 +142,7 @@ class Service:
 
     def live(self, owner: str, job_id: str) -> LiveView:
         """What the job's texture looks like now."""
-        record = self._look(owner, job_id)
+        record = self._live_record(owner, job_id)
         if record is None:
             return LiveView()
         # The step makes the address a new one, so that no cache answers with an older picture.
@@ -157,7 +155,7 @@ class Service:
 
     def live_picture(self, owner: str, job_id: str, name: str) -> bytes:
         """A JPEG of `live`."""
-        record = self._look(owner, job_id)
+        record = self._live_record(owner, job_id)
         for picture in record.pictures if record else ():
             if picture.name == name:
                 return picture.jpeg
@@ -165,97 +163,31 @@ class Service:
 
     # -- inside ---------------------------------------------------------------------------------------------------
 
-    def _look(self, owner: str, job_id: str) -> LiveRecord | None:
+    def _live_record(self, owner: str, job_id: str) -> LiveRecord | None:
         row = self.store.records.job(job_id, owner)
         return None if row.state == JobState.succeeded else self.store.live.read(job_id, row.attempt)
 
-    @contextmanager
-    def _holding(self, reservation: Reservation | None) -> Iterator[None]:
-        """The check of a large scan takes longer than a reservation lasts: a thread renews it meanwhile."""
-        if reservation is None:
-            yield
+    def _look(self, owner: str, spec: JobSpec) -> None:
+        """What can be said of the scan without reading it: whether it is there, and may be read."""
+        if spec.source is not None:
+            try:
+                self.store.references.look(spec.source)
+            except (BlobNotFound, ReferenceRefused) as error:
+                remedy = "give the URL of a scan that the server can read, or upload it"
+                detail = ErrorDetail(code="source", where="body.source", message=str(error), remedy=remedy)
+                raise ApiError(ErrorCode.invalid_source, str(error), [detail]) from error
             return
-        done = threading.Event()
-
-        def renew() -> None:
-            while not done.wait(HOLD_SECONDS / 3):
-                with suppress(SQLAlchemyError, StoreError):
-                    self.store.submissions.renew(reservation)
-
-        thread = threading.Thread(target=renew, name="reservation", daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            done.set()
-            thread.join()
-
-    def _checked_job(self, caller: Caller, spec: JobSpec, reservation: Reservation | None) -> JobRow:
-        owner = caller.owner
-        with self._local_scan(owner, spec) as path:
-            report = check_scan(path, spec.options.layout)
-        details = [
-            ErrorDetail(severity=f.severity, code=f.code, where=f.where, message=f.message, remedy=f.remedy)
-            for f in report.findings
-        ]
-        if report.ok:
-            return self.store.submissions.create_job(
-                owner,
-                spec,
-                warnings=details,
-                reservation=reservation,
-                memory_bytes=needed_memory(
-                    spec.options, report.frames_usable, *report.view_size, fuses=report.mesh is None
-                ),
-                max_active_jobs=caller.max_active_jobs,
-            )
-        rejection = _rejection(details)
-        return self.store.submissions.create_job(owner, spec, rejection=rejection, reservation=reservation)
-
-    @contextmanager
-    def _local_scan(self, owner: str, spec: JobSpec) -> Iterator[Path]:
-        """The scan as a file or folder of this machine."""
-        blobs = self.store.blobs
-        blobs.spool_dir.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(suffix=".part", dir=blobs.spool_dir) as folder:
-            if spec.source is not None:
-                yield self._referred(spec.source, Path(folder))
-                return
-            assert spec.upload_id is not None
-            upload = self.store.uploads.upload(spec.upload_id, owner)
-            if upload.sha256 is None:
-                state = f"{upload.offset} of {upload.size}"
-                raise ApiError(ErrorCode.not_ready, f"upload {upload.id} is not complete: {state}")
-            key = keys.scan_key(upload.id)
-            if not isinstance(blobs, FolderBlobs):
-                blobs.fetch(key, Path(folder) / "scan.zip")
-                yield Path(folder) / "scan.zip"
-            elif blobs.exists(key):
-                yield blobs.path(key)
-            else:
-                raise BlobNotFound(key)
-
-    def _referred(self, source: str, folder: Path) -> Path:
-        try:
-            return self.store.references.fetch(source, folder)
-        except (BlobNotFound, ReferenceRefused) as error:
-            remedy = "give the URL of a scan that the server can read, or upload it"
-            detail = ErrorDetail(code="source", where="body.source", message=str(error), remedy=remedy)
-            raise ApiError(ErrorCode.invalid_source, str(error), [detail]) from error
-
-
-def _rejection(details: list[ErrorDetail]) -> JobError:
-    errors = [detail for detail in details if detail.severity == "error"]
-    more = f" (and {len(errors) - 1} more problems)" if len(errors) > 1 else ""
-    first = f"{errors[0].where} {errors[0].message}".lstrip()  # some are of the scan as a whole
-    message = f"the scan cannot be textured: {first}{more}"
-    return JobError(code=ErrorCode.invalid_scan, message=message, details=details)
+        assert spec.upload_id is not None
+        upload = self.store.uploads.upload(spec.upload_id, owner)
+        if upload.sha256 is None:
+            state = f"{upload.offset} of {upload.size}"
+            raise ApiError(ErrorCode.not_ready, f"upload {upload.id} is not complete: {state}")
+        self.store.blobs.head(keys.scan_key(upload.id))
 
 
 def job_view(row: JobRow) -> JobView:
     """The row as the API shows it."""
-    state = JobState(row.state)
-    paused = row.waiting_reason if state is JobState.running else ""
+    state = row.state
     results = [
         ResultFile(
             name=f["name"],
@@ -276,7 +208,7 @@ def job_view(row: JobRow) -> JobView:
         options=JobOptions.model_validate(known_options(row.options)),
         priority=row.priority,
         attempt=row.attempt - 1 if state in WAITING else row.attempt,
-        waiting_reason=(row.waiting_reason or IN_LINE) if state in WAITING else paused,
+        waiting_reason=row.waiting_reason or REASONS.get(state, "") if state not in TERMINAL else "",
         memory_bytes=row.memory_bytes,
         progress=Progress.model_validate(row.progress),
         warnings=[ErrorDetail.model_validate(w) for w in row.warnings],

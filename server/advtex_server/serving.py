@@ -15,13 +15,13 @@ from collections.abc import Callable, Iterator, Sequence
 import uvicorn
 
 from advtex_server.app import create_app
-from advtex_server.children import Child
 from advtex_server.embedded import EmbeddedRedis, SetupError, client_key, only_one
 from advtex_server.settings import ServerSettings
 from advtex_store.accounts import Accounts, key_id
 from advtex_store.database import Database, upgrade_database
 from advtex_store.secrecy import hide_environment
 from advtex_store.sessions import Sessions
+from advtex_store.supervision import Supervised
 
 WORKER_STOP_SECONDS = 60.0  # a worker writes its checkpoint in this time
 WATCH_SECONDS = 0.5
@@ -59,7 +59,7 @@ def up(settings: ServerSettings, host: str, port: int) -> None:
             key = client_key(settings.data_dir, Accounts(database), _url(listener))
             token = Sessions(database).offer(key_id(key))
             database.close()
-            worker = Child(
+            worker = Supervised(
                 "worker",
                 [sys.executable, "-m", "advtex_worker.main"],
                 environment(settings),
@@ -76,14 +76,14 @@ def up(settings: ServerSettings, host: str, port: int) -> None:
 
 
 def run(
-    settings: ServerSettings, listener: socket.socket, children: Sequence[Child], ready: Callable[[], None]
+    settings: ServerSettings, listener: socket.socket, children: Sequence[Supervised], ready: Callable[[], None]
 ) -> None:
     """Serve until SIGTERM or SIGINT; then stop the API and the children, the last one first."""
     asyncio.run(_run(settings, listener, children, ready))
 
 
 async def _run(
-    settings: ServerSettings, listener: socket.socket, children: Sequence[Child], ready: Callable[[], None]
+    settings: ServerSettings, listener: socket.socket, children: Sequence[Supervised], ready: Callable[[], None]
 ) -> None:
     app = create_app(settings)
     # What was made so far lives as long as the process: looked through by every full collection, it stops all answers
@@ -120,7 +120,7 @@ async def _run(
             await asyncio.to_thread(child.wait)
 
 
-async def _watch(server: uvicorn.Server, children: Sequence[Child], ready: Callable[[], None]) -> None:
+async def _watch(server: uvicorn.Server, children: Sequence[Supervised], ready: Callable[[], None]) -> None:
     while not server.started:
         await asyncio.sleep(0.02)
     ready()

@@ -7,8 +7,7 @@ from datetime import UTC, datetime
 import structlog
 
 from advtex_contract.errors import ErrorCode, ErrorDetail
-from advtex_contract.jobs import JobState
-from advtex_contract.webhooks import EVENTS, WebhookList, WebhookSpec, WebhookView
+from advtex_contract.webhooks import WebhookList, WebhookSpec, WebhookView
 from advtex_server.refusal import ApiError
 from advtex_server.targets import TargetRefused, TargetRules
 from advtex_store.models import WebhookRow
@@ -26,8 +25,6 @@ class WebhookService:
 
     def create(self, owner: str, spec: WebhookSpec) -> WebhookView:
         """With its secret. ApiError if nothing may be sent there."""
-        if unknown := spec.events - EVENTS:
-            raise _refused("events", f"{', '.join(sorted(unknown))} is never told", "leave it out")
         try:
             self._rules.resolve(spec.url)
         except TargetRefused as refusal:
@@ -58,7 +55,7 @@ def _view(row: WebhookRow, *, with_secret: bool = False) -> WebhookView:
     return WebhookView(
         id=row.id,
         url=row.url,
-        events=[JobState(event) for event in row.events],
+        events=row.events,
         secret=row.secret if with_secret else None,
         failures=row.failures,
         last_error=row.last_error,

@@ -10,7 +10,7 @@ from typing import Any
 
 from sqlalchemy import Select, func, select
 
-from advtex_contract.jobs import TERMINAL, JobState, Progress
+from advtex_contract.jobs import PENDING, TERMINAL, JobState, Progress
 from advtex_store.database import Database
 from advtex_store.errors import RecordNotFound
 from advtex_store.models import JobRow
@@ -23,7 +23,7 @@ class BatchSummary:
     """Counts by state, and the seconds that are left, None if nothing was measured yet."""
 
     id: str
-    states: Mapping[JobState, int]
+    states: Mapping[str, int]
     created_at: float
     updated_at: float
     eta_seconds: float | None = None
@@ -63,11 +63,7 @@ class Batches:
                 mine.where(JobRow.state == JobState.succeeded).order_by(JobRow.id.desc()).limit(MEASURED)
             ).all()
             running = session.execute(mine.where(JobRow.state == JobState.running)).all()
-            waiting = session.scalars(
-                mine.with_only_columns(JobRow.options).where(
-                    JobRow.state.in_((JobState.uploading, JobState.queued, JobState.preempted))
-                )
-            ).all()
+            waiting = session.scalars(mine.with_only_columns(JobRow.options).where(JobRow.state.in_(PENDING))).all()
         eta = remaining_seconds(
             [(o, Progress.model_validate(p)) for o, p in ended],
             [(o, Progress.model_validate(p)) for o, p in running],
@@ -104,8 +100,8 @@ class Batches:
             return list(session.scalars(query.order_by(JobRow.id)))
 
     @staticmethod
-    def _counts(rows: Sequence[Any]) -> tuple[dict[JobState, int], float, float]:
-        states = {JobState(state): int(count) for _, state, count, _, _ in rows}
+    def _counts(rows: Sequence[Any]) -> tuple[dict[str, int], float, float]:
+        states = {state: int(count) for _, state, count, _, _ in rows}
         first = min((created for *_, created, _ in rows), default=0.0)
         last = max((updated for *_, updated in rows), default=0.0)
         return states, first, last

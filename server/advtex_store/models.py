@@ -113,6 +113,8 @@ class JobRow(Base):
     source: the URL of a scan that stays where it is; its upload row is a mere placeholder.
     memory_bytes: what a worker must have (`needs.py`). memory_gib: the same as the class of the smallest such worker.
     waiting_reason: for people, the dispatcher's while the job waits and the worker's while it pauses.
+    checked_at: when its scan was found good. Until then `worker`, `lease_expires_at` and `deaths` are the checker's
+    (`checks.py`); a time without a worker is when the next check may begin.
     tidied_at: when what no result needs was removed.
     """
 
@@ -129,6 +131,7 @@ class JobRow(Base):
     priority: Mapped[int] = mapped_column(default=0)
     memory_bytes: Mapped[int] = mapped_column(BigInteger, default=0)
     memory_gib: Mapped[int] = mapped_column(BigInteger, Computed("(memory_bytes + 1073741823) / 1073741824"))
+    checked_at: Mapped[float | None]
     waiting_reason: Mapped[str] = mapped_column(default="")
     attempt: Mapped[int] = mapped_column(default=1)
     worker: Mapped[str | None]

@@ -1,4 +1,4 @@
-"""Job rows, and the one table of legal state transitions.
+"""Job rows, and what may become of them (`STATES` in `advtex_contract.jobs`).
 
 How a worker carries a job (`store = open_store(settings)`; RQ calls `advtex_worker.tasks.run_job(job_id, attempt)`):
 
@@ -37,7 +37,7 @@ from sqlalchemy import ColumnElement, and_, func, select, update
 from sqlalchemy.orm import Session
 
 from advtex_contract.errors import ErrorDetail
-from advtex_contract.jobs import TERMINAL, JobError, JobState, Progress
+from advtex_contract.jobs import RETRYABLE, STATES, TERMINAL, WAITING, JobError, JobState, Progress
 from advtex_contract.options import JobOptions
 from advtex_store import keys
 from advtex_store.accounts import check_active_jobs
@@ -51,18 +51,6 @@ from advtex_store.troubles import ADOPT, not_aside
 from advtex_store.webhooks import tell_webhooks
 
 S = JobState
-TRANSITIONS: Mapping[JobState, frozenset[JobState]] = {
-    S.uploading: frozenset({S.queued, S.rejected, S.canceled}),
-    # A waiting job can succeed: a late attempt's manifest is adopted instead of doing the work again.
-    S.queued: frozenset({S.running, S.succeeded, S.canceled}),
-    S.preempted: frozenset({S.running, S.succeeded, S.canceled}),
-    S.running: frozenset({S.queued, S.preempted, S.succeeded, S.failed, S.canceled, S.rejected}),
-    S.failed: frozenset({S.queued}),
-    S.canceled: frozenset({S.queued}),
-    S.succeeded: frozenset(),
-    S.rejected: frozenset(),
-}
-WAITING = frozenset({S.queued, S.preempted})
 POISON_DEATHS = 3
 EXPLAINED = 1000  # waiting rows that are told in one go why they wait
 
@@ -103,7 +91,7 @@ class Records:
         """Take a waiting job. StaleAttempt: it is not waiting for this attempt (any more)."""
         with self.database.write() as session:
             expires_at = self.database.now(session) + (lease_seconds or self.lease_seconds)
-            row = self._move(
+            row = self.move(
                 session,
                 job_id,
                 S.running,
@@ -183,8 +171,8 @@ class Records:
         with self.database.write() as session:
             sources = None if attempt is None else frozenset({S.running})
             data = [dict(result) for result in results]
-            row = self._move(session, job_id, S.succeeded, fence=attempt, sources=sources, results=data)
-            self._finish(session, row, warnings=[*row.warnings, *(w.model_dump(mode="json") for w in warnings)])
+            row = self.move(session, job_id, S.succeeded, fence=attempt, sources=sources, results=data)
+            self.finish(session, row, warnings=[*row.warnings, *(w.model_dump(mode="json") for w in warnings)])
 
     def fail(self, job_id: str, attempt: int, error: JobError) -> None:
         """The attempt failed for a reason that a new attempt would meet again."""
@@ -203,9 +191,9 @@ class Records:
         with self.database.write() as session:
             row = self._running(session, job_id, attempt)
             if row.cancel_requested:
-                self._finish(session, self._move(session, job_id, S.canceled, fence=attempt))
+                self.finish(session, self.move(session, job_id, S.canceled, fence=attempt))
                 return S.canceled
-            self._move(session, job_id, S.preempted, fence=attempt, **_released(attempt + 1))
+            self.move(session, job_id, S.preempted, fence=attempt, **_released(attempt + 1))
             tally(session, ATTEMPTS, "preempted")
             return S.preempted
 
@@ -223,7 +211,7 @@ class Records:
             tally(session, ATTEMPTS, "lost")
             deaths = 1 if row.reached > row.reached_at_claim else row.deaths + 1
             if row.cancel_requested:
-                self._finish(session, self._move(session, job_id, S.canceled, fence=attempt))
+                self.finish(session, self.move(session, job_id, S.canceled, fence=attempt))
                 return S.canceled
             if deaths >= POISON_DEATHS:
                 error = JobError(
@@ -233,10 +221,10 @@ class Records:
                     "Try smaller views or a smaller texture, or retry on a larger machine.",
                     log_tail=row.log_tail,
                 )
-                moved = self._move(session, job_id, S.failed, fence=attempt, deaths=deaths, error=error.model_dump())
-                self._finish(session, moved)
+                moved = self.move(session, job_id, S.failed, fence=attempt, deaths=deaths, error=error.model_dump())
+                self.finish(session, moved)
                 return S.failed
-            self._move(session, job_id, S.queued, fence=attempt, deaths=deaths, **_released(attempt + 1))
+            self.move(session, job_id, S.queued, fence=attempt, deaths=deaths, **_released(attempt + 1))
             return S.queued
 
     # -- dispatcher and reconciler --------------------------------------------------------------------------------
@@ -304,7 +292,7 @@ class Records:
             return list(session.scalars(query.order_by(EventRow.version)))
 
     def cancel(self, job_id: str, owner: str | None = None) -> JobRow:
-        """A waiting job ends at once; a running one is asked to. Canceling a canceled job changes nothing."""
+        """A running job is asked to end, any other ends at once. Canceling a canceled job changes nothing."""
         with self.database.write() as session:
             row = self._get(session, job_id, owner, lock=True)
             if row.state == S.canceled or (row.state == S.running and row.cancel_requested):
@@ -313,16 +301,18 @@ class Records:
                 row.cancel_requested = True
                 row.version, row.updated_at = row.version + 1, self.database.now(session)
                 return row
-            return self._finish(session, self._move(session, job_id, S.canceled, attempt=row.attempt - 1))
+            begun = row.attempt - 1 if JobState(row.state) in WAITING else row.attempt
+            return self.finish(session, self.move(session, job_id, S.canceled, attempt=begun))
 
     def retry(self, job_id: str, owner: str | None = None, *, max_active_jobs: int | None = None) -> JobRow:
-        """A failed or canceled job goes on from its checkpoint with a new attempt. QuotaExceeded."""
+        """A failed or canceled job goes on from its checkpoint with a new attempt, or with its check. QuotaExceeded."""
         with self.database.write() as session:
             row = self._get(session, job_id, owner, lock=True)
             check_active_jobs(session, row.owner, max_active_jobs)
             ended = {"cancel_requested": False, "error": None, "finished_at": None, "expires_at": None, "deaths": 0}
-            sources = frozenset({S.failed, S.canceled})
-            return self._move(session, job_id, S.queued, sources=sources, **ended, **_released(row.attempt + 1))
+            to = S.checking if row.checked_at is None else S.queued
+            following = _released(row.attempt + (to is S.queued))
+            return self.move(session, job_id, to, sources=RETRYABLE, **ended, **following)
 
     def delete(self, job_id: str, owner: str | None = None) -> None:
         """Hide an ended job; its blobs follow (`purged`)."""
@@ -337,8 +327,8 @@ class Records:
     def _end(self, job_id: str, attempt: int, to: JobState, error: JobError | None) -> None:
         with self.database.write() as session:
             data = None if error is None else error.model_dump(mode="json")
-            self._finish(
-                session, self._move(session, job_id, to, sources=frozenset({S.running}), fence=attempt, error=data)
+            self.finish(
+                session, self.move(session, job_id, to, sources=frozenset({S.running}), fence=attempt, error=data)
             )
 
     def _get(self, session: Session, job_id: str, owner: str | None, *, lock: bool = False) -> JobRow:
@@ -356,7 +346,7 @@ class Records:
             raise StaleAttempt(self._why_stale(session, job_id, attempt))
         return row
 
-    def _move(
+    def move(
         self,
         session: Session,
         job_id: str,
@@ -366,8 +356,8 @@ class Records:
         sources: frozenset[JobState] | None = None,
         **values: Any,
     ) -> JobRow:
-        """Compare-and-set along TRANSITIONS. `fence`: only if this is the job's attempt; `sources`: only from these."""
-        allowed = {state for state, targets in TRANSITIONS.items() if to in targets}
+        """Compare-and-set along `STATES`. `fence`: only if this is the job's attempt; `sources`: only from these."""
+        allowed = {state for state, facts in STATES.items() if to in facts.becomes}
         where = [JobRow.id == job_id, JobRow.deleted_at.is_(None), JobRow.state.in_(allowed & (sources or allowed))]
         if fence is not None:
             where.append(JobRow.attempt == fence)
@@ -385,7 +375,8 @@ class Records:
         tell_webhooks(session, row, now)
         return row
 
-    def _finish(self, session: Session, row: JobRow, **values: Any) -> JobRow:
+    def finish(self, session: Session, row: JobRow, **values: Any) -> JobRow:
+        """What is due when a job has moved to a state that ends it."""
         row.finished_at = self.database.now(session)
         row.expires_at = row.finished_at + row.retention_seconds
         row.lease_expires_at = None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,7 +19,7 @@ from advtex_store.errors import BlobNotFound, BlobsRefused, ReferenceRefused, Re
 from advtex_store.files import translated
 
 if TYPE_CHECKING:
-    from advtex_store.s3 import BucketReader
+    from advtex_store.s3 import BucketReader, FoundObject
 
 _BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
 
@@ -41,12 +41,39 @@ class _Place:
         return same and self.parts[: len(root.parts)] == root.parts
 
 
+@dataclass(frozen=True, slots=True)
+class RemoteScan:
+    """A scan in object storage. `files` and `fetch`: as `advtex_scan.open_remote` takes them."""
+
+    label: str
+    files: int | Mapping[str, int]
+    fetch: Callable[[str, int, int], bytes]
+
+
 class References:
     """`roots`: URLs of folders, or of buckets and prefixes."""
 
     def __init__(self, roots: Sequence[str]) -> None:
         self.roots = tuple(roots)
         self._roots = tuple(_resolved(_parse(root)) for root in roots)
+
+    def look(self, url: str) -> Path | RemoteScan:
+        """The scan where it is, of which nothing is read yet. Raises as `fetch` does."""
+        place = self._allowed(url)
+        if place.scheme == "file":
+            _check_readable(place.path, url)
+            return place.path
+        try:
+            bucket, name, found = _found(place, url)
+        except BlobsRefused as error:
+            raise _unreadable(url, error) from error
+        alone = found[0].size if found[0].name == name else None
+        inside = {key.removeprefix(f"{name}/"): size for key, size, _ in found}
+
+        def read(file: str, start: int, end: int) -> bytes:
+            return bucket.read(f"{name}/{file}" if file else name, start, end)
+
+        return RemoteScan(name, inside if alone is None else alone, read)
 
     def fetch(self, url: str, folder: Path, check: Callable[[], None] = lambda: None) -> Path:
         """The scan on this machine: in place for `file://`, else copied below `folder`, with the objects' times.
@@ -61,7 +88,7 @@ class References:
         try:
             return _copy(place, url, folder, check)
         except BlobsRefused as error:
-            raise ReferenceUnreadable(f"{url} cannot be read by the service: {error}") from error
+            raise _unreadable(url, error) from error
 
     def _allowed(self, url: str) -> _Place:
         place = _parse(url)
@@ -118,7 +145,12 @@ def _check_readable(path: Path, url: str) -> None:
         raise ReferenceUnreadable(f"{url} cannot be read by the service ({error.strerror}): {remedy}") from None
 
 
-def _copy(place: _Place, url: str, folder: Path, check: Callable[[], None]) -> Path:
+def _unreadable(url: str, error: BlobsRefused) -> ReferenceUnreadable:
+    return ReferenceUnreadable(f"{url} cannot be read by the service: {error}")
+
+
+def _found(place: _Place, url: str) -> tuple[BucketReader, str, list[FoundObject]]:
+    """The bucket's part that holds the scan, the scan's name there, and its objects."""
     from advtex_store.s3 import BucketReader
 
     if not place.parts:
@@ -132,9 +164,15 @@ def _copy(place: _Place, url: str, folder: Path, check: Callable[[], None]) -> P
     total = sum(item.size for item in found)
     if len(found) > limits.entries or total > limits.total_bytes:
         raise ReferenceRefused(f"{url} is no scan: it holds {len(found)} objects, {total} bytes")
+    for item in found:
+        if (reason := unsafe_reason(item.name)) is not None:
+            raise ReferenceRefused(f"{url} holds {item.name!r}: {reason}")
+    return bucket, name, found
+
+
+def _copy(place: _Place, url: str, folder: Path, check: Callable[[], None]) -> Path:
+    bucket, name, found = _found(place, url)
     for key, _, modified in found:
-        if (reason := unsafe_reason(key)) is not None:
-            raise ReferenceRefused(f"{url} holds {key!r}: {reason}")
         try:
             _download(bucket, key, folder / key, check)
             os.utime(folder / key, ns=(modified, modified))

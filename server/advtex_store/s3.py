@@ -147,6 +147,11 @@ class BucketReader:
                 pages = obstore.list(self._store, prefix=name)
                 return sorted(_found(meta["path"], meta) for page in pages for meta in page)
 
+    def read(self, name: str, start: int, end: int) -> bytes:
+        """The bytes of an object from `start` up to, not including, `end`."""
+        with _translated(name):
+            return bytes(obstore.get_range(self._store, name, start=start, end=end))
+
     def stream(self, name: str) -> Iterator[bytes]:
         """The bytes of an object, in chunks."""
         with _translated(name):

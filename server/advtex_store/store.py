@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from advtex_store.accounts import Accounts
 from advtex_store.batches import Batches
 from advtex_store.blobs import Blobs, open_blobs
+from advtex_store.checks import Checks
 from advtex_store.database import Database
 from advtex_store.live import Live
 from advtex_store.live_progress import LiveProgress
@@ -31,6 +32,7 @@ class Store:
     settings: StoreSettings
     database: Database
     records: Records
+    checks: Checks
     uploads: Uploads
     submissions: Submissions
     accounts: Accounts
@@ -64,6 +66,7 @@ def open_store(settings: StoreSettings) -> Store:
         settings=settings,
         database=database,
         records=records,
+        checks=Checks(records),
         uploads=Uploads(database, retention_seconds=retention),
         submissions=Submissions(database, retention_seconds=retention),
         accounts=Accounts(database),

@@ -1,8 +1,8 @@
 """New jobs, lists of them, and idempotency keys.
 
-A request with an idempotency key first reserves it, then checks the scan, then creates the job and binds the key to it
-in one transaction. The request renews its reservation while it works; one whose server died is taken over after
-`HOLD_SECONDS`, which is as long as a client that tries again has to wait.
+A request with an idempotency key first reserves it, then looks whether the scan is there, then creates the job and
+binds the key to it in one transaction. One whose server died is taken over after `HOLD_SECONDS`, which is as long as a
+client that tries again has to wait.
 """
 
 from __future__ import annotations
@@ -14,14 +14,12 @@ from sqlalchemy import delete, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
-from advtex_contract.errors import ErrorDetail
-from advtex_contract.jobs import JobError, JobSpec, JobState, Progress
+from advtex_contract.jobs import JobSpec, JobState, Progress
 from advtex_store.accounts import check_active_jobs
 from advtex_store.database import Database
 from advtex_store.errors import IdempotencyInFlight, IdempotencyMismatch, RecordNotFound
 from advtex_store.ids import new_id
 from advtex_store.models import EventRow, IdempotencyRow, JobRow, UploadRow
-from advtex_store.tallies import tally_end
 from advtex_store.webhooks import tell_webhooks
 
 HOLD_SECONDS = 15.0
@@ -80,16 +78,6 @@ class Submissions:
             row.holder, row.held_until = holder, now + HOLD_SECONDS
             return Reservation(owner, token, holder)
 
-    def renew(self, reservation: Reservation) -> None:
-        """The request is still working; does nothing for a reservation that another request took over."""
-        with self.database.write() as session:
-            session.execute(
-                update(IdempotencyRow)
-                .where(IdempotencyRow.owner == reservation.owner, IdempotencyRow.token == reservation.token)
-                .where(IdempotencyRow.holder == reservation.holder)
-                .values(held_until=self.database.now(session) + HOLD_SECONDS)
-            )
-
     def release(self, reservation: Reservation) -> None:
         """The request made no job: the key is free again."""
         with self.database.write() as session:
@@ -107,47 +95,38 @@ class Submissions:
         owner: str,
         spec: JobSpec,
         *,
-        warnings: list[ErrorDetail] | None = None,
-        rejection: JobError | None = None,
         reservation: Reservation | None = None,
-        memory_bytes: int = 0,
         max_active_jobs: int | None = None,
     ) -> JobRow:
-        """A job in state `queued`, or `rejected` when there is a rejection. RecordNotFound: no such finished upload.
+        """A job whose scan is to be checked (`Checks`). RecordNotFound: no such finished upload.
 
         QuotaExceeded: the owner has `max_active_jobs` jobs already that have not ended.
         """
         retention = spec.retention_seconds or self.retention_seconds
         with self.database.write() as session:
-            if rejection is None:
-                check_active_jobs(session, owner, max_active_jobs)
+            check_active_jobs(session, owner, max_active_jobs)
             now = self.database.now(session)
             upload = _placeholder(session, owner, spec.source, now) if spec.source else _finished(session, owner, spec)
             # Also keeps a reconciler that is just letting the upload go from doing so: it looks at this time again.
             upload.expires_at = max(upload.expires_at or 0.0, now + retention)
-            state = JobState.rejected if rejection else JobState.queued
             row = JobRow(
                 id=new_id(now),
                 owner=owner,
                 upload_id=upload.id,
                 source=spec.source,
                 batch=spec.batch,
-                state=state.value,
+                state=JobState.checking.value,
                 label=spec.label,
                 options=spec.options.model_dump(mode="json"),
                 priority=spec.priority,
-                memory_bytes=memory_bytes,
-                attempt=0 if rejection else 1,
+                attempt=0,
                 progress=Progress().model_dump(mode="json"),
-                warnings=[w.model_dump(mode="json") for w in warnings or []],
-                error=rejection.model_dump(mode="json") if rejection else None,
+                warnings=[],
                 results=[],
                 version=1,
                 created_at=now,
                 updated_at=now,
-                finished_at=now if rejection else None,
                 retention_seconds=retention,
-                expires_at=now + retention if rejection else None,
             )
             session.add(row)
             session.flush()
@@ -155,12 +134,10 @@ class Submissions:
                 EventRow(
                     job_id=row.id,
                     version=1,
-                    data={"kind": "state", "state": state.value, "attempt": row.attempt, "at": now},
+                    data={"kind": "state", "state": row.state, "attempt": row.attempt, "at": now},
                 )
             )
             tell_webhooks(session, row, now)
-            if rejection is not None:
-                tally_end(session, row.state, row.error, {})
             if reservation is not None:
                 _bind(session, reservation, row.id)
             return row

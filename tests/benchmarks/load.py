@@ -25,11 +25,15 @@ from typing import Any
 import psutil
 
 from advtex_contract.jobs import JobSpec, JobState, Progress
+from advtex_contract.options import JobOptions
 from advtex_server.settings import ServerSettings
 from advtex_store.database import upgrade_database
 from advtex_store.ids import new_id
 from advtex_store.models import JobRow
 from advtex_store.store import Store, open_store
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+from checked import queued_job
 
 CORES = 2
 UPLOAD_BYTES = 16_000_000
@@ -171,7 +175,7 @@ def fill(store: Store, finished: int) -> str:
     """That many finished jobs. -> a running one."""
     upload_row = store.uploads.create("load", 1)
     store.uploads.finish(upload_row.id, "ab" * 32)
-    running = store.submissions.create_job("load", JobSpec(upload_id=upload_row.id))
+    running = queued_job(store, "load", JobSpec(upload_id=upload_row.id))
     result = {"name": "model.glb", "key": "k", "size": 1, "sha256": "ab" * 32, "content_type": "model/gltf-binary"}
     with store.database.write() as session:
         now = store.database.now(session)
@@ -183,7 +187,7 @@ def fill(store: Store, finished: int) -> str:
                     owner="load",
                     upload_id=upload_row.id,
                     state=JobState.succeeded,
-                    options=running.options,
+                    options=JobOptions().model_dump(mode="json"),
                     progress=Progress(stage="previews").model_dump(mode="json"),
                     warnings=[],
                     results=[result] * 6,
@@ -195,8 +199,8 @@ def fill(store: Store, finished: int) -> str:
                     tidied_at=made,
                 )
             )
-    store.records.claim(running.id, 1, "load")
-    return running.id
+    store.records.claim(running, 1, "load")
+    return running
 
 
 def keep_running(store: Store, job: str, done: threading.Event) -> None:

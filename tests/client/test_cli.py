@@ -85,6 +85,39 @@ def test_a_bad_scan_is_4_with_every_finding_and_its_remedy(server: FakeServer, s
     assert all(detail["remedy"] for detail in body["details"] if detail["severity"] == "error")
 
 
+@pytest.mark.parametrize(
+    ("state", "exit_code"), [(JobState.queued, 0), (JobState.running, 0), (JobState.rejected, 4), (JobState.failed, 5)]
+)
+def test_submit_waits_for_the_servers_check(server: FakeServer, scan: Path, state: JobState, exit_code: int) -> None:
+    server.begins = JobState.checking
+    details = [ErrorDetail(where="mesh.ply", message="is empty", remedy="add faces")]
+    error = JobError(code="x", message="the scan cannot be textured", details=details) if exit_code else None
+    warnings = [] if exit_code else [ErrorDetail(severity="warning", message="is dark")]
+    server.script = [
+        view("j0", JobState.checking, waiting_reason="its scan is being checked"),
+        view("j0", state, error=error, warnings=warnings),
+    ]
+    ran = run("submit", scan, "--json")
+    assert ran.exit_code == exit_code
+    assert json.loads(ran.stdout)["state"] == state
+    assert "job j0: checking (its scan is being checked)" in ran.stderr
+    assert "submitted before" not in ran.stderr
+    if exit_code == 4:
+        assert json.loads(ran.stderr.splitlines()[-1])["error"]["details"][0]["remedy"] == "add faces"
+    elif exit_code == 0:
+        assert "is dark" in ran.stderr
+    again = run("submit", scan)
+    assert again.exit_code == 0
+    assert ("submitted before" in again.stderr) == bool(exit_code)
+
+
+def test_a_check_that_takes_too_long_is_7(server: FakeServer, scan: Path) -> None:
+    server.begins = JobState.checking
+    ran = run("submit", scan, "--timeout", "0.05")
+    assert ran.exit_code == 7
+    assert "checking at last sight" in ran.stderr
+
+
 def test_a_layout_can_be_asked_for(server: FakeServer, scan: Path) -> None:
     assert json.loads(run("check", scan, "--layout", "native", "--json").stdout)["layout"] == "native"
     refused = run("check", scan, "--layout", "tum")

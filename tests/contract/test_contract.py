@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from advtex_contract.errors import ErrorBody, ErrorCode, ErrorDetail
-from advtex_contract.jobs import TERMINAL, JobSpec, JobState, JobView
+from advtex_contract.jobs import RETRYABLE, STATES, TERMINAL, JobSpec, JobState, JobView
 from advtex_contract.options import METHOD_HELP, PRESET_HELP, JobOptions, Method, Preset
 
 
@@ -74,9 +74,14 @@ def test_labels_are_one_printable_line(label: str) -> None:
         assert not bad
 
 
-def test_terminal_states() -> None:
-    not_ended = {JobState.uploading, JobState.queued, JobState.running, JobState.preempted}
-    assert set(JobState) - TERMINAL == not_ended
+def test_the_table_has_all_states_and_their_ends() -> None:
+    assert list(STATES) == list(JobState), "in the order in which the page lists them"
+    assert set(JobState) - TERMINAL == {JobState.checking, JobState.queued, JobState.running, JobState.preempted}
+    assert {JobState.failed, JobState.canceled} == RETRYABLE
+    assert {state for state in STATES if not STATES[state].becomes} == TERMINAL - RETRYABLE
+    for state, facts in STATES.items():
+        assert facts.becomes <= set(JobState) - {state}
+        assert f"`{state}` {facts.meaning}" in (JobState.__doc__ or "")
 
 
 def test_a_job_survives_the_wire() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 from typing import Any
 
 import pytest
@@ -46,6 +47,18 @@ def test_a_job_of_a_newer_version_is_read() -> None:
     assert view.progress.stage == "atlas"
     assert view.error is not None
     assert view.error.code == "c"
+
+
+def test_a_job_in_a_state_that_only_a_newer_version_knows_goes_on() -> None:
+    view = jobs.JobView.model_validate(JOB | {"state": "from_the_future"})
+    assert view.state == "from_the_future"
+    assert view.state not in jobs.TERMINAL
+    assert jobs.JobView.model_validate_json(view.model_dump_json()) == view
+    assert jobs.JobView.model_validate(JOB).state is jobs.JobState.queued
+    batch = {"id": "b", "jobs": 2, "states": {"from_the_future": 1, "queued": 1}, "finished": False}
+    times = {key: JOB[key] for key in ("created_at", "updated_at")}
+    read = jobs.BatchView.model_validate_json(json.dumps(batch | times))
+    assert read.states == {"from_the_future": 1, jobs.JobState.queued: 1}
 
 
 def test_a_job_of_an_older_version_is_read() -> None:

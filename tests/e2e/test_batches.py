@@ -65,7 +65,9 @@ def test_a_submission_that_is_killed_goes_on_without_a_second_job_or_upload(serv
         process.send_signal(signal.SIGKILL)
         process.wait()
         begun = [job.id for job in client.list_jobs()]
-    assert data(service.run_client("batch", "resume", "night", "--json"))["states"] == {"queued": 4}
+    assert data(service.run_client("batch", "resume", "night", "--json"))["jobs"] == 4
+    with service.client() as client:
+        wait_until(lambda: client.get_batch("night").states == {"queued": 4})
     assert data(service.run_client("batch", "submit", str(scenes), "--id", "night", "--json"))["jobs"] == 4
     with service.client() as client:
         jobs = list(client.list_jobs(batch="night"))

@@ -84,7 +84,7 @@ def test_a_bad_scan_is_refused_before_it_is_sent_and_by_the_server_too(service: 
         assert list(client.list_jobs()) == []
         upload = client.upload(scan)  # as a client without the check would do
         job = client.create_job(JobSpec(upload_id=upload.id), idempotency_key="k")
-        assert job.state is JobState.rejected
+        assert job.state is JobState.checking
         with pytest.raises(ScanRejectedError) as caught:
             client.wait_for_job(job.id)
     assert any("mesh.ply" in detail.where + detail.message for detail in caught.value.details)
@@ -115,6 +115,7 @@ def test_the_check_and_the_server_say_the_same(service: LiveService, tmp_path: P
     with service.client() as client:
         upload = client.upload(folder)  # as a client without the check would do
         job = client.create_job(JobSpec(upload_id=upload.id), idempotency_key="k")
+        *_, job = client.watch_job(job.id)
     assert job.state is JobState.rejected
     assert job.error is not None
     assert [detail.model_dump() for detail in job.error.details] == findings

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +20,8 @@ from fastapi.routing import APIRoute
 
 from advtex_server.app import create_app
 from advtex_server.settings import ServerSettings
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
 QUICK: dict[str, Any] = {
     "redis_url": "redis://127.0.0.1:1/0",
@@ -97,11 +101,20 @@ class Live:
         assert response.status_code == 201, response.text
         return str(response.json()["id"])
 
-    def job(self, upload_id: str, key: str | None = None, **spec: object) -> dict[str, Any]:
+    def job(self, upload_id: str | None = None, key: str | None = None, **spec: object) -> dict[str, Any]:
+        """A new job once its scan is checked."""
         headers = {} if key is None else {"Idempotency-Key": key}
         response = self.http.post("/v1/jobs", json={"upload_id": upload_id, **spec}, headers=headers)
         assert response.status_code == 201, response.text
-        return dict(response.json())
+        return self.checked(response.json()["id"])
+
+    def checked(self, job_id: str) -> dict[str, Any]:
+        """The job once its scan is checked."""
+        deadline = time.monotonic() + 30
+        while (job := self.http.get(f"/v1/jobs/{job_id}").json())["state"] == "checking":
+            assert time.monotonic() < deadline, job
+            time.sleep(0.02)
+        return dict(job)
 
     def finished_job(self, scan: Path, files: dict[str, Path]) -> str:
         """Do what a worker does."""

@@ -31,9 +31,7 @@ def live(make_live: Callable[..., Any], scans: Path) -> Any:
 def test_a_job_by_reference(live: Any, scans: Path, is_error: Any) -> None:
     for name, state in (("good", "queued"), ("packed.zip", "queued"), ("bad", "rejected")):
         source = (scans / name).as_uri()
-        answer = live.http.post("/v1/jobs", json={"source": source, "batch": "night"})
-        assert answer.status_code == 201, answer.text
-        job = answer.json()
+        job = live.job(source=source, batch="night")
         assert (job["state"], job["source"], job["batch"]) == (state, source, "night")
         shown = live.http.get(f"/v1/jobs/{job['id']}").json()
         assert (shown["source"], shown["batch"]) == (source, "night")
@@ -65,7 +63,7 @@ def test_one_scan_and_a_plain_name_are_needed(live: Any, is_error: Any, spec: di
 
 
 def test_an_upload_held_by_reference_takes_no_bytes(live: Any, scans: Path, is_error: Any) -> None:
-    job = live.http.post("/v1/jobs", json={"source": (scans / "good").as_uri()}).json()
+    job = live.job(source=(scans / "good").as_uri())
     headers = {
         "Tus-Resumable": "1.0.0",
         "Upload-Offset": "0",
@@ -79,8 +77,8 @@ def test_an_upload_held_by_reference_takes_no_bytes(live: Any, scans: Path, is_e
 
 def test_a_batch_from_beginning_to_end(live: Any, scans: Path, is_error: Any) -> None:
     source = (scans / "good").as_uri()
-    jobs = [live.http.post("/v1/jobs", json={"source": source, "batch": "night"}).json()["id"] for _ in range(4)]
-    live.http.post("/v1/jobs", json={"source": (scans / "bad").as_uri(), "batch": "night"})
+    jobs = [live.job(source=source, batch="night")["id"] for _ in range(4)]
+    live.job(source=(scans / "bad").as_uri(), batch="night")
     records = live.store.records
     for job in jobs[:2]:
         records.claim(job, 1, "test")
@@ -104,7 +102,7 @@ def test_a_batch_from_beginning_to_end(live: Any, scans: Path, is_error: Any) ->
 
 @pytest.mark.one_machine("tests/store has the same on both databases")
 def test_batches_belong_to_their_owner(live: Any, scans: Path, is_error: Any) -> None:
-    live.http.post("/v1/jobs", json={"source": (scans / "good").as_uri(), "batch": "night"})
+    live.job(source=(scans / "good").as_uri(), batch="night")
     with live.client(live.store.accounts.create_key("other")) as other:
         is_error(other.get("/v1/batches/night"), 404, "not_found")
         is_error(other.post("/v1/batches/night/cancel"), 404, "not_found")

@@ -20,7 +20,6 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from advtex_server import embedded
-from advtex_server.children import Child
 from advtex_server.embedded import SetupError, free_port, only_one, redis_binary, write_private
 from advtex_server.main import app
 
@@ -127,6 +126,7 @@ def test_up(up: Up, tmp_path: Path, scan_zip: Path) -> None:
 
     upload = up.http.post("/v1/uploads", content=scan_zip.read_bytes()).json()["id"]
     job = up.http.post("/v1/jobs", json={"upload_id": upload}).json()
+    until(lambda: up.http.get(f"/v1/jobs/{job['id']}").json()["state"] == "queued")
     with up.http.stream("GET", f"/v1/jobs/{job['id']}/events") as response:
         next(response.iter_lines())
         children = up.children()
@@ -272,34 +272,3 @@ def test_private_files(tmp_path: Path) -> None:
         pass
     with only_one(tmp_path / "data"):
         pass
-
-
-def test_a_child_that_does_not_stop_is_killed_with_its_own_children() -> None:
-    script = "trap '' TERM; sleep 60 & echo; wait; sleep 60"
-    child = Child("stubborn", ["sh", "-c", script], dict(os.environ), stop_seconds=0.3)
-    child.start()
-    assert child.pid is not None
-    process = psutil.Process(child.pid)
-    grandchildren = until(process.children)
-    child.ask_to_stop()
-    child.wait()
-    assert child.pid is None
-    until(lambda: not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in grandchildren))
-
-
-def test_a_child_that_keeps_dying_is_started_ever_more_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [1000.0]
-    monkeypatch.setattr("advtex_server.children.time.monotonic", lambda: now[0])
-    child = Child("dying", ["true"], dict(os.environ), stop_seconds=1)
-    child.start()
-    pauses = []
-    for _ in range(6):
-        assert child._process is not None
-        child._process.wait()
-        dead, begun = child._process, now[0]
-        while child._process is dead:
-            child.watch()
-            now[0] += 0.5
-        pauses.append(now[0] - begun - 0.5)
-    child.wait()
-    assert pauses == [1.0, 2.0, 5.0, 10.0, 30.0, 30.0]

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import redis
+from checked import queued_job
 
 from advtex_contract.jobs import JobSpec
 from advtex_server.dispatch import Dispatcher
@@ -40,7 +41,7 @@ def submit(store: Store, owner: str = "me", *, gib: int = 0, priority: int = 0) 
     upload = store.uploads.create(owner, 3)
     store.uploads.finish(upload.id, "ab" * 32)
     spec = JobSpec(upload_id=upload.id, priority=priority)
-    return store.submissions.create_job(owner, spec, memory_bytes=gib << 30).id
+    return queued_job(store, owner, spec, gib << 30)
 
 
 def only_workers(store: Store, *classes: int) -> None:

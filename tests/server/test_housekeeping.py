@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from checked import queued_job
 from prometheus_client import CollectorRegistry, generate_latest
 
 from advtex_contract.jobs import JobSpec
@@ -40,7 +41,7 @@ def submit(store: Store) -> str:
     upload = store.uploads.create("me", 3)
     store.blobs.put(keys.scan_key(upload.id), b"abc")
     store.uploads.finish(upload.id, "ab" * 32)
-    return store.submissions.create_job("me", JobSpec(upload_id=upload.id)).id
+    return queued_job(store, "me", JobSpec(upload_id=upload.id))
 
 
 def told(store: Store, settings: ServerSettings) -> str:

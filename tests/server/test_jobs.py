@@ -34,9 +34,11 @@ def test_a_good_scan_is_queued(live: Any, scan_zip: Path) -> None:
     assert response.status_code == 201
     job = JobView.model_validate_json(response.content)
     assert response.headers["location"] == f"/v1/jobs/{job.id}"
-    assert (job.state, job.attempt, job.label, job.options.preset) == ("queued", 0, "chair", "preview")
-    assert job.memory_bytes == needed_memory(job.options, views=5, width=32, height=24)
-    assert lasting(live.http.get(f"/v1/jobs/{job.id}").json()) == lasting(response.json())
+    assert (job.state, job.attempt, job.label, job.options.preset) == ("checking", 0, "chair", "preview")
+    assert (job.waiting_reason, job.memory_bytes) == ("its scan is being checked", 0)
+    queued = JobView.model_validate(live.checked(job.id))
+    assert (queued.state, queued.attempt, queued.label, queued.options) == ("queued", 0, job.label, job.options)
+    assert queued.memory_bytes == needed_memory(job.options, views=5, width=32, height=24)
 
 
 def test_a_bad_scan_is_rejected_with_every_finding(live: Any, is_error: Any) -> None:
@@ -79,20 +81,20 @@ def test_a_key_in_flight_is_a_conflict(
     live: Any, scan_zip: Path, is_error: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     upload = live.upload(scan_zip.read_bytes())
-    checking, go_on = threading.Event(), threading.Event()
+    looking, go_on = threading.Event(), threading.Event()
     service = live.app.state.service
-    original = service._checked_job
+    original = service._look
 
     def slow(*args: Any) -> Any:
-        checking.set()
+        looking.set()
         assert go_on.wait(10)
         return original(*args)
 
-    monkeypatch.setattr(service, "_checked_job", slow)
+    monkeypatch.setattr(service, "_look", slow)
     jobs: list[dict[str, Any]] = []
     first = threading.Thread(target=lambda: jobs.append(live.job(upload, "key")))
     first.start()
-    assert checking.wait(10)
+    assert looking.wait(10)
     response = live.http.post("/v1/jobs", json={"upload_id": upload}, headers={"Idempotency-Key": "key"})
     go_on.set()
     first.join()
@@ -200,7 +202,7 @@ def test_events_follow_a_job_and_replay(live: Any, scan_zip: Path) -> None:
     assert [view.state for view in views] == ["queued", "running", "running", "succeeded"]
     assert views[2].progress.steps == 2
     states = [data.get("state") or data["stage"] for _, name, data in told if name != "job"]
-    assert states == ["queued", "running", "optimization", "succeeded"]
+    assert states == ["checking", "queued", "running", "optimization", "succeeded"]
 
     running = next(number for number, name, data in told if name == "state" and data["state"] == "running")
     replayed = live.http.get(f"/v1/jobs/{job_id}/events", headers={"Last-Event-ID": str(running)})
@@ -385,7 +387,7 @@ def test_streams_of_one_job_share_a_look(live: Any, monkeypatch: pytest.MonkeyPa
         assert row.id == job_id
         assert f'"id":"{job_id}"' in message
         assert first.events(0) is first.events(0)
-        assert [event.version for event in await first.events(0)] == [row.version]
+        assert [event.version for event in await first.events(0)] == [1, row.version]
         with pytest.raises(RecordNotFound):
             await lookout.look("you", job_id).job
         first.at -= FRESH_SECONDS

@@ -15,6 +15,8 @@ from typing import Any
 import httpx
 import pytest
 
+from advtex_contract.jobs import RETRYABLE, STATES, TERMINAL
+from advtex_contract.stages import STAGE_LABELS
 from advtex_server import static_files
 from advtex_server.browsers import HEADERS
 from advtex_server.doorkeeper import KNOWN_SECONDS
@@ -223,6 +225,26 @@ def test_lists_are_filtered_and_paged(live: Any, browser: httpx.Client) -> None:
     assert [job["label"] for job in some] == ["Kitchen 33", "Kitchen 31", "Kitchen 3"]
     assert data_of(browser.get("/", params={"label": "100%"}))["jobs"] == []
     assert {batch["id"]: batch["jobs"] for batch in data_of(first)["batches"]} == {"night": 17, "day": 18}
+
+
+def test_the_words_of_states_and_stages_are_the_contracts(browser: httpx.Client) -> None:
+    page = browser.get("/").text
+    found = re.search(r'<script type="application/json" id="words">(.*?)</script>', page)
+    assert found is not None
+    words = json.loads(found[1])
+    assert list(words["stages"].items()) == list(STAGE_LABELS.items()), "in their order"
+    assert [state for state, told in words["states"].items() if told["terminal"]] == [
+        s for s in STATES if s in TERMINAL
+    ]
+    assert {state for state, told in words["states"].items() if told["retryable"]} == RETRYABLE
+    for state, facts in STATES.items():
+        assert words["states"][state]["label"] == facts.label
+        assert f'<option value="{state}">{facts.label}</option>' in page
+    sheet = re.search(r'href="([^"]*page.css)"', page)
+    assert sheet is not None
+    style = browser.get(sheet[1]).text
+    for tone in {facts.tone for facts in STATES.values()} - {"plain"}:
+        assert f".badge.{tone} " in style
 
 
 def test_changes_are_streamed_and_replayed(live: Any, browser: httpx.Client) -> None:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import pytest
 
 from advtex_contract.jobs import JobSpec
 from advtex_store.accounts import Accounts
 from advtex_store.batches import Batches
+from advtex_store.checks import Checks
 from advtex_store.database import Database
 from advtex_store.records import Records
 from advtex_store.submissions import Submissions
 from advtex_store.uploads import Uploads
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
 OWNER = "someone"
 
@@ -36,6 +41,7 @@ class Bench:
     clock: Clock
     owner: str = OWNER
     records: Records = field(init=False)
+    checks: Checks = field(init=False)
     uploads: Uploads = field(init=False)
     submissions: Submissions = field(init=False)
     batches: Batches = field(init=False)
@@ -43,6 +49,7 @@ class Bench:
 
     def __post_init__(self) -> None:
         self.records = Records(self.database, lease_seconds=60)
+        self.checks = Checks(self.records)
         self.uploads = Uploads(self.database, retention_seconds=1000)
         self.submissions = Submissions(self.database, retention_seconds=1000)
         self.batches = Batches(self.database)
@@ -55,7 +62,9 @@ class Bench:
     def job(self, owner: str = OWNER, **spec: object) -> str:
         if "source" not in spec:
             spec.setdefault("upload_id", self.finished_upload(owner))
-        return self.submissions.create_job(owner, JobSpec.model_validate(spec)).id
+        from checked import queued_job
+
+        return queued_job(self, owner, JobSpec.model_validate(spec))
 
     def state(self, job_id: str) -> tuple[str, int]:
         row = self.records.job(job_id)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from advtex_contract.jobs import JobError, JobSpec, JobState
+from advtex_contract.jobs import JobSpec, JobState
 from advtex_store.errors import IdempotencyInFlight, IdempotencyMismatch, RecordNotFound
 from advtex_store.submissions import HOLD_SECONDS, JobFilter, Reservation
 
@@ -25,14 +25,6 @@ def test_a_job_renews_its_upload(bench: Any) -> None:
     bench.clock.now += 900
     bench.submissions.create_job(bench.owner, JobSpec(upload_id=upload))
     assert bench.uploads.upload(upload).expires_at == bench.clock.now + 1000
-
-
-def test_a_rejected_job_is_recorded_and_never_waits(bench: Any) -> None:
-    spec = JobSpec(upload_id=bench.finished_upload())
-    row = bench.submissions.create_job(bench.owner, spec, rejection=JobError(code="invalid_scan", message="no mesh"))
-    assert bench.state(row.id) == ("rejected", 0)
-    assert bench.records.waiting(10) == []
-    assert bench.records.job(row.id).expires_at == bench.clock.now + 1000
 
 
 def test_pages_show_every_job_once_newest_first(bench: Any) -> None:
@@ -98,19 +90,6 @@ def test_a_dead_request_gives_its_key_away_and_makes_no_second_job(bench: Any) -
         bench.submissions.create_job(bench.owner, spec, reservation=slow)
     job = bench.submissions.create_job(bench.owner, spec, reservation=fast)
     assert [row.id for row in bench.submissions.list_jobs(bench.owner)[0]] == [job.id]
-
-
-def test_a_request_that_still_works_keeps_its_key(bench: Any) -> None:
-    spec = JobSpec(upload_id=bench.finished_upload())
-    slow = bench.submissions.reserve(bench.owner, "key", "body")
-    for _ in range(3):
-        bench.clock.now += HOLD_SECONDS - 1
-        bench.submissions.renew(slow)
-    with pytest.raises(IdempotencyInFlight):
-        bench.submissions.reserve(bench.owner, "key", "body")
-    job = bench.submissions.create_job(bench.owner, spec, reservation=slow)
-    bench.submissions.renew(slow)
-    assert bench.submissions.reserve(bench.owner, "key", "body").id == job.id
 
 
 def test_many_requests_at_once_make_one_job(bench: Any) -> None:

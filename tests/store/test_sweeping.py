@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from checked import queued_job
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
@@ -150,7 +151,7 @@ class World:
         self.uploads.append(row.id)
         self.blobs.put(keys.scan_key(row.id), SCAN)
         self.bench.uploads.finish(row.id, "ab" * 32)
-        self.jobs.append(self.bench.submissions.create_job("me", JobSpec(upload_id=row.id)).id)
+        self.jobs.append(queued_job(self.bench, "me", JobSpec(upload_id=row.id)))
 
     def run_job(self) -> None:
         """The newest job is claimed and has a checkpoint."""
@@ -160,7 +161,7 @@ class World:
 
     def create_job(self) -> None:
         spec = JobSpec(upload_id=self.pick(self.uploads))
-        self.jobs.append(self.bench.submissions.create_job("me", spec).id)
+        self.jobs.append(queued_job(self.bench, "me", spec))
 
     def checkpoint(self) -> None:
         job = self.pick(self.jobs)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from advtex_contract.jobs import TERMINAL, JobError, JobState
+from advtex_contract.jobs import TERMINAL, JobError, JobSpec, JobState
 from advtex_store.errors import QuotaExceeded, RecordNotFound
 from advtex_store.models import DeliveryRow
 from advtex_store.webhooks import KEPT_SECONDS, MOST_FAILURES, MOST_PER_OWNER, PAUSES, TRY_SECONDS, Webhooks
@@ -43,18 +43,16 @@ def test_the_change_and_its_news_are_one(bench: Any, webhooks: Webhooks) -> None
     assert failed["data"]["error"] == {"code": "engine_error", "message": "it broke"}
     job = bench.job()
     with pytest.raises(ZeroDivisionError), bench.database.write() as session:  # noqa: PT012
-        bench.records._move(session, job, JobState.canceled)
+        bench.records.move(session, job, JobState.canceled)
         raise ZeroDivisionError
     assert len(outbox(bench)) == 3, "a change that was rolled back was told"
 
 
 def test_a_rejected_job_is_told(bench: Any, webhooks: Webhooks) -> None:
-    from advtex_contract.jobs import JobSpec
-
-    webhooks.create(bench.owner, URL, TERMINAL)
-    spec = JobSpec(upload_id=bench.finished_upload())
-    bench.submissions.create_job(bench.owner, spec, rejection=JobError(code="invalid_scan", message="no mesh"))
-    assert [told["type"] for told in outbox(bench)] == ["job.rejected"]
+    webhooks.create(bench.owner, URL, TERMINAL | {JobState.checking})
+    bench.submissions.create_job(bench.owner, JobSpec(upload_id=bench.finished_upload()))
+    bench.checks.rejected(bench.checks.claim(), JobError(code="invalid_scan", message="no mesh"))
+    assert [told["type"] for told in outbox(bench)] == ["job.checking", "job.rejected"]
 
 
 def test_one_try_at_a_time_per_webhook(bench: Any, webhooks: Webhooks) -> None:

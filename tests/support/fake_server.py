@@ -35,6 +35,7 @@ class FakeServer:
         self.requests: list[httpx.Request] = []
         self.faults: list[Fault] = []
         self.script: list[JobView] = []
+        self.begins = JobState.queued  # what new jobs are
         self.events = False
         self.readiness = Readiness(ready=True, checks={"database": PartView(ok=True, essential=True)})
         self.key = KeyView(id="0123", scopes=["read", "write"], active_jobs=0, bytes=0)
@@ -133,7 +134,7 @@ class FakeServer:
             earlier, job_id = self.keys[key]
             return ok(self.jobs[job_id]) if earlier == body.decode() else error(422, ErrorCode.idempotency_mismatch)
         spec = JobSpec.model_validate_json(body)
-        job = view(f"j{len(self.jobs)}", upload_id=spec.upload_id, options=spec.options, label=spec.label)
+        job = view(f"j{len(self.jobs)}", self.begins, upload_id=spec.upload_id, options=spec.options, label=spec.label)
         job.retention_seconds = spec.retention_seconds or 0
         self.jobs[job.id] = job
         self.keys[key] = (body.decode(), job.id)

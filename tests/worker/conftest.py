@@ -51,6 +51,8 @@ def new_job(store: Store) -> Callable[..., str]:
         written = store.blobs.put(keys.scan_key(upload.id), data)
         store.uploads.finish(upload.id, written.sha256)
         spec = JobSpec(upload_id=upload.id, options=JobOptions.model_validate(options))
-        return store.submissions.create_job("owner", spec).id
+        from checked import queued_job
+
+        return queued_job(store, "owner", spec)
 
     return make

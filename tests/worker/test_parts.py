@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 
 from advtex_contract.jobs import Progress
 from advtex_contract.options import JobOptions, Method, Preset
+from advtex_contract.stages import STAGE_LABELS
 from advtex_engine.core import config as engine
 from advtex_engine.core.monitor import STAGES
 from advtex_store.errors import StaleAttempt
@@ -29,7 +30,6 @@ from advtex_store.queue import TASK
 from advtex_store.records import Lease
 from advtex_worker import lease
 from advtex_worker.adapt import texture_config
-from advtex_worker.child import death_sentence
 from advtex_worker.events import (
     CheckpointEvent,
     DiskFullEvent,
@@ -154,14 +154,6 @@ def test_other_lines_are_no_events(line: str) -> None:
         parse_event(line)
 
 
-@pytest.mark.parametrize(
-    ("code", "words"),
-    [(-9, "out of memory"), (-11, "SIGSEGV"), (-15, "SIGTERM"), (3, "exit code 3"), (-50, "signal 50"), (0, "without")],
-)
-def test_a_death_is_a_sentence(code: int, words: str) -> None:
-    assert words in death_sentence(code)
-
-
 class Clock:
     now = 100.0
 
@@ -180,6 +172,10 @@ def test_the_eta_counts_only_steps_of_this_attempt() -> None:
     assert tracker.view.eta_seconds == pytest.approx(90.0)
     tracker.stage(StageEvent(stage="export"))
     assert tracker.view.eta_seconds is None
+
+
+def test_the_contract_has_words_for_the_engines_stages() -> None:
+    assert tuple(STAGE_LABELS) == STAGES
 
 
 @given(st.lists(st.tuples(st.sampled_from(STAGES), st.integers(0, 1_000_000)), max_size=20))

@@ -119,9 +119,10 @@ SLEEPER = "import os, sys, time; open(sys.argv[1], 'a').write(os.environ['ADVTEX
 SUPERVISOR = """
 import sys
 from pathlib import Path
+from advtex_store import supervision
 from advtex_worker import slots
 from advtex_worker.settings import WorkerSettings
-slots.RESTART_SECONDS = (0.1,)
+supervision.RESTART_SECONDS = (0.1,)
 settings = WorkerSettings(data_dir=Path("/nowhere"))
 slots.supervise([sys.executable, "-c", sys.argv[2], sys.argv[1]], slots.find_slots(settings), settings)
 """

@@ -35,8 +35,9 @@ from advtex_store.errors import (
 from advtex_store.files import translated
 from advtex_store.records import Claim
 from advtex_store.store import Store
+from advtex_store.supervision import how_it_ended
 from advtex_worker.checkpoints import CheckpointUploader, restore
-from advtex_worker.child import Child, death_sentence
+from advtex_worker.child import Child
 from advtex_worker.events import (
     CheckpointEvent,
     DiskFullEvent,
@@ -287,7 +288,7 @@ class Attempt:
 
     def _conclude(self, ended: FinishedEvent | FailedEvent | StoppedEvent | None, code: int) -> None:
         records, job_id, number = self._store.records, self._job_id, self._number
-        self._log.info("runner ended", ending=ended.kind if ended else death_sentence(code), asked=self._keeper.ending)
+        self._log.info("runner ended", ending=ended.kind if ended else how_it_ended(code), asked=self._keeper.ending)
         if self._keeper.ending is Ending.lost:
             return
         self._keeper.beat()  # the newest progress is recorded before the end
@@ -306,7 +307,7 @@ class Attempt:
         elif self._keeper.ending or isinstance(ended, StoppedEvent):
             self._give_back()
         else:
-            sentence = death_sentence(code)
+            sentence = f"the engine's process {how_it_ended(code)}"
             told = f"{tail.rstrip()}\n{sentence}\n".lstrip()
             state = self._record(lambda: records.lost(job_id, number, log_tail=told))
             self._log.warning("runner died", reason=sentence, job_is=state)

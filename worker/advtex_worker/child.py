@@ -1,4 +1,4 @@
-"""The runner as its parent sees it: started, listened to, asked to stop, and its death put into words."""
+"""The runner as its parent sees it: started, listened to, asked to stop, and ended."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LOG_TAIL_BYTES = 6000
 class Child:
     """A running runner, and a context manager that outlasts it.
 
-    Made on a thread that lives as long as the child is wanted (`parentage.py`).
+    Made on a thread that lives as long as the child is wanted (`die_with_parent`).
     gpu: UUID of the only one that it sees; None for all. returncode: of the process once the block has ended, negative
     for a signal.
     """
@@ -103,15 +103,3 @@ class Child:
         with self._lock, suppress(BrokenPipeError, ValueError):  # it is dead; that is noticed where events are read
             pipe.write(line.encode())
             pipe.flush()
-
-
-def death_sentence(code: int) -> str:
-    """How a process ended, for people: its return code as `subprocess` gives it."""
-    if code >= 0:
-        return f"the engine's process ended without a result (exit code {code})"
-    known = {signal.SIGKILL: "was killed (out of memory?)", signal.SIGSEGV: "crashed in native code"}
-    try:
-        signum = signal.Signals(-code)
-    except ValueError:
-        return f"the engine's process was ended by signal {-code}"
-    return f"the engine's process {known.get(signum, 'was ended')}: {signum.name}"

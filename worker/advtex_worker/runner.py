@@ -26,6 +26,7 @@ from advtex_contract.errors import ErrorDetail
 from advtex_contract.live import LiveRecord
 from advtex_engine.core.errors import EngineError, MemoryShortage, OptionError, Problem, ScanError, Stopped
 from advtex_engine.core.monitor import Glimpse, Monitor
+from advtex_store.supervision import die_with_parent
 from advtex_worker.adapt import texture_config
 from advtex_worker.events import (
     CANCEL_LINE,
@@ -45,7 +46,6 @@ from advtex_worker.events import (
     StoppedEvent,
     WarningEvent,
 )
-from advtex_worker.parentage import die_with_parent
 
 ENGINE = "advtex_engine.pipeline:texture_scan"
 VIEW_NAME = 200  # characters of a frame's name that are shown

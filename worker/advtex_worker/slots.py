@@ -9,23 +9,20 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import FrameType
 from typing import IO
 
 import structlog
 
+from advtex_store.supervision import Supervised
 from advtex_worker.locks import first_lock, lock_paths
 from advtex_worker.memory import list_gpus, usable_memory
-from advtex_worker.parentage import die_with_parent
 from advtex_worker.settings import WorkerSettings
 
 POLL_SECONDS = 0.2
-RESTART_SECONDS = (1.0, 2.0, 5.0, 10.0, 30.0)  # pauses before further starts of a slot that keeps dying
-STEADY_SECONDS = 60.0  # one that lived this long starts again at the shortest pause
 
 log = structlog.get_logger()
 
@@ -83,7 +80,8 @@ def hold(slot: Slot, jobs: int, wait: Callable[[float], object]) -> IO[bytes] | 
 
 def supervise(command: Sequence[str], slots: Sequence[Slot], settings: WorkerSettings) -> None:
     """One process per slot, started again when it dies, until SIGTERM or SIGINT; each then gives its job back."""
-    keepers = [_Keeper(command, _environment(settings_of(slot, settings, len(slots)))) for slot in slots]
+    environments = [_environment(settings_of(slot, settings, len(slots))) for slot in slots]
+    children = [Supervised(f"slot {number}", command, told) for number, told in enumerate(environments)]
     stopping = False
 
     def stop(_signum: int, _frame: FrameType | None) -> None:
@@ -92,60 +90,20 @@ def supervise(command: Sequence[str], slots: Sequence[Slot], settings: WorkerSet
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, stop)
+    for child in children:
+        child.start()
     while not stopping:
-        for keeper in keepers:
-            keeper.watch()
+        for child in children:
+            child.watch()
         time.sleep(POLL_SECONDS)
-    for keeper in keepers:
-        keeper.ask_to_stop()
-    for keeper in keepers:
-        keeper.wait()
+    for child in children:
+        child.ask_to_stop()
+    for child in children:
+        child.wait()
 
 
 def _environment(settings: WorkerSettings) -> dict[str, str]:
-    told = {"ADVTEX_GPU": settings.gpu or "", "ADVTEX_THREADS": str(settings.threads)}
+    told = os.environ | {"ADVTEX_GPU": settings.gpu or "", "ADVTEX_THREADS": str(settings.threads)}
     if settings.memory_bytes is not None:
         told["ADVTEX_MEMORY_BYTES"] = str(settings.memory_bytes)
     return told
-
-
-class _Keeper:
-    """A slot's process. Made and watched on the main thread, which lives as long as the process is wanted."""
-
-    def __init__(self, command: Sequence[str], environment: Mapping[str, str]) -> None:
-        self._command, self._environment = command, environment
-        self._process: subprocess.Popen[bytes] | None = None
-        self._started = self._next_start = 0.0
-        self._failures = 0
-
-    def watch(self) -> None:
-        now = time.monotonic()
-        if self._process is not None:
-            if self._process.poll() is None:
-                return
-            self._failures = 0 if now - self._started > STEADY_SECONDS else self._failures + 1
-            pause = RESTART_SECONDS[min(max(self._failures, 1), len(RESTART_SECONDS)) - 1]
-            log.warning("a slot's process died, starts again", exit_code=self._process.returncode, pause=pause)
-            self._process, self._next_start = None, now + pause
-        if now >= self._next_start:
-            self._start()
-
-    def ask_to_stop(self) -> None:
-        if self._process is not None and self._process.poll() is None:
-            self._process.send_signal(signal.SIGTERM)
-
-    def wait(self) -> None:
-        if self._process is not None:
-            self._process.wait()
-
-    def _start(self) -> None:
-        parent = os.getpid()
-        self._process = subprocess.Popen(
-            self._command,
-            env=os.environ | self._environment,
-            stdin=subprocess.DEVNULL,
-            start_new_session=True,  # a Ctrl-C reaches the supervisor alone, which asks each process once
-            preexec_fn=lambda: die_with_parent(parent, signal.SIGTERM),
-        )
-        self._started = time.monotonic()
-        log.info("slot started", pid=self._process.pid, gpu=self._environment["ADVTEX_GPU"])

@@ -70,7 +70,11 @@ def create_job(
     response: Response,
     idempotency_key: Annotated[str | None, Header(min_length=1, max_length=200)] = None,
 ) -> JobView:
-    """Texture the scan of a finished upload. A bad scan gives a job in state `rejected` with every finding."""
+    """Texture the scan of a finished upload, or one that the server can read.
+
+    The job is `checking` until its scan is checked: a good one is `queued` then, a bad one `rejected` with every
+    finding.
+    """
     view, new = service.create_job(caller, spec, idempotency_key)
     if not new:
         response.status_code = 200
@@ -100,7 +104,7 @@ async def get_job(job_id: JobId, caller: Reader, service: TheService) -> Respons
 
 @router.post("/{job_id}/cancel", responses=OF_A_JOB | refuses(ErrorCode.conflict))
 def cancel_job(job_id: JobId, caller: Writer, service: TheService) -> JobView:
-    """A waiting job ends at once; a running one is stopped with a checkpoint."""
+    """A running job is stopped with a checkpoint; any other ends at once."""
     return service.cancel(caller.owner, job_id)
 
 
@@ -109,7 +113,7 @@ def cancel_job(job_id: JobId, caller: Writer, service: TheService) -> JobView:
     responses=OF_A_JOB | refuses(ErrorCode.conflict, ErrorCode.rate_limited, ErrorCode.quota_exceeded),
 )
 def retry_job(job_id: JobId, caller: Writer, service: TheService) -> JobView:
-    """A failed or canceled job goes on from its checkpoint."""
+    """A failed or canceled job goes on from its checkpoint, or with the check of its scan."""
     return service.retry(caller, job_id)
 
 

@@ -16,8 +16,9 @@ from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
 
 from advtex_contract.errors import ErrorCode
-from advtex_contract.jobs import JobState, Label
+from advtex_contract.jobs import RETRYABLE, STATES, JobState, Label
 from advtex_contract.options import METHOD_HELP, PRESET_COST, PRESET_HELP, JobOptions, Preset
+from advtex_contract.stages import STAGE_LABELS
 from advtex_scan.layouts import LAYOUT_NAMES
 from advtex_server import static_files
 from advtex_server.browsers import Guests, check_same_origin, cookie_name
@@ -45,7 +46,13 @@ VIEWER_POLICY = (
     .replace("connect-src 'self'", "connect-src 'self' blob:")
 )
 _RETURN = re.compile(r"/(new|jobs/[0-9A-Za-z_-]{1,64})?(\?[A-Za-z0-9._%&=-]*)?")
-_STATES = [state for state in JobState if state is not JobState.uploading]
+_WORDS = {
+    "states": {
+        state: {"label": facts.label, "tone": facts.tone, "terminal": facts.terminal, "retryable": state in RETRYABLE}
+        for state, facts in STATES.items()
+    },
+    "stages": STAGE_LABELS,
+}
 _PRESETS = (Preset.auto, Preset.preview, Preset.standard, Preset.full, Preset.paper)  # by their cost
 _OPTIONS = JobOptions.model_json_schema()["properties"]
 
@@ -96,7 +103,7 @@ async def jobs_page(
 ) -> Response:
     """All jobs, newest first."""
     caller = await _reader(request)
-    wanted = JobFilter(JobState(state) if state in _STATES else None, label.strip() or None, batch or None)
+    wanted = JobFilter(JobState(state) if state in STATES else None, label.strip() or None, batch or None)
     store = service.store
     now = await run_in_threadpool(store.overviews.now)
     rows, following = await run_in_threadpool(store.overviews.jobs, caller.owner, wanted, cursor or None, PAGE_JOBS)
@@ -108,7 +115,7 @@ async def jobs_page(
         "first": not cursor,
         "since": int(now * 1000),
     }
-    return _page("jobs.html", caller, data=data, following=following, states=_STATES)
+    return _page("jobs.html", caller, data=data, following=following, states=STATES)
 
 
 @router.get("/new")
@@ -214,7 +221,7 @@ async def _reader(request: Request) -> Caller:
 
 def _page(template: str, caller: Caller | None, policy: str = POLICY, *, status: int = 200, **values: Any) -> Response:
     here = template.removesuffix(".html")
-    values = {"data": None, "static": f"/static/{static_files.version()}", "caller": caller, **values}
+    values = {"data": None, "words": _WORDS, "static": f"/static/{static_files.version()}", "caller": caller, **values}
     html = templates.get_template(template).render(here=here, status=status, **values)
     return HTMLResponse(html, status, {"Content-Security-Policy": policy, "Cache-Control": "no-store"})
 

@@ -1,14 +1,11 @@
 // What all pages share: calls of the API, streams that come back by themselves, words for numbers, elements.
 
 export const data = JSON.parse(document.getElementById("data").textContent);
-export const LABELS = {
-  ingest: "Reading the scan", conventions: "Measuring conventions", fusion: "Fusing depth into a mesh",
-  geometry: "Cleaning the mesh", refinement: "Refining cameras", atlas: "Laying out the texture",
-  view_maps: "Mapping views to texels", initial_texture: "First texture", optimization: "Optimizing the texture",
-  dilation: "Filling borders", export: "Writing the model", previews: "Drawing previews",
-};
-export const STAGES = Object.keys(LABELS);
-export const TERMINAL = ["succeeded", "failed", "canceled", "rejected"];
+// The words of states and stages, in their order: `STATES` and `STAGE_LABELS` of the contract.
+const { states, stages } = JSON.parse(document.getElementById("words").textContent);
+export const STAGES = Object.keys(stages);
+export const TERMINAL = Object.keys(states).filter((state) => states[state].terminal);
+export const RETRYABLE = TERMINAL.filter((state) => states[state].retryable);
 const RETURN_MS = 2000;
 
 export class CallError extends Error {
@@ -128,8 +125,9 @@ export function moment(text) {
 }
 
 export const count = (value) => value.toLocaleString("en");
-export const badge = (state) => el("span", { class: `badge ${state}` }, state);
-export const stageName = (stage) => LABELS[stage] ?? stage.replaceAll("_", " ");
+export const tone = (state) => states[state]?.tone ?? "plain";
+export const badge = (state) => el("span", { class: `badge ${tone(state)}` }, states[state]?.label ?? state);
+export const stageName = (stage) => stages[stage] ?? stage.replaceAll("_", " ");
 
 /** How far a stage is, as a bar; one that does not know moves to and fro. */
 export function meter(step, steps, label) {

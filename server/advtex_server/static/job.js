@@ -1,6 +1,6 @@
 // One job: where it stands, live while it runs, and what came of it.
 
-import { STAGES, TERMINAL, ask, badge, bytes, call, count, data, duration, el, findings, follow, meter, moment, notice, stageName } from "./base.js";
+import { RETRYABLE, STAGES, TERMINAL, ask, badge, bytes, call, count, data, duration, el, findings, follow, meter, moment, notice, stageName } from "./base.js";
 import { showCurves } from "./chart.js";
 import { showResult, showScan, showStages } from "./result.js";
 
@@ -24,7 +24,7 @@ function showHeading() {
   const button = (name, act, kind = "") => el("button", { class: kind, onclick: act }, name);
   const actions = [
     !ended && button("Cancel", cancel),
-    ["failed", "canceled"].includes(job.state) && button("Retry", () => change("POST", `${path}/retry`), "primary"),
+    RETRYABLE.includes(job.state) && button("Retry", () => change("POST", `${path}/retry`), "primary"),
     ended && button("Delete", remove, "danger"),
   ].filter(Boolean);
   const names = actions.map((action) => action.textContent).join();

@@ -1,6 +1,6 @@
 // The list of jobs: drawn from what the page brought, kept up to date by the stream of changes.
 
-import { TERMINAL, ask, badge, call, count, data, duration, el, follow, meter, moment, notice, placeholder, stageName } from "./base.js";
+import { TERMINAL, ask, badge, call, count, data, duration, el, follow, meter, moment, notice, placeholder, stageName, tone } from "./base.js";
 
 const BATCH_MS = 2000;
 const list = document.getElementById("jobs");
@@ -72,7 +72,7 @@ const newest = () => list.firstElementChild?.dataset.id ?? "";
 function share(batch) {
   const bar = el("div", { class: "share", "aria-hidden": "true" });
   for (const [state, jobs] of Object.entries(batch.states)) {
-    const part = el("span", { class: state });
+    const part = el("span", { class: tone(state) });
     part.style.flexGrow = jobs;
     bar.append(part);
   }

@@ -6,6 +6,7 @@ import { zipDirectory, zipped } from "./zip.js";
 
 const PIECE = 16 << 20; // bytes per request: after each the server has confirmed them
 const RETRIES = [0, 1000, 2000, 4000, 8000, 15000, 15000, 30000, 30000, 60000, 60000, 60000];
+const CHECK_MS = 500; // between looks whether the server has checked the scan
 const SPEED_MS = 6000; // over which speed is measured
 const byId = (id) => document.getElementById(id);
 const form = byId("submit");
@@ -157,7 +158,11 @@ async function submit() {
   const uploadId = await send(body, scan.file ? scan.name : `${scan.name}.zip`, fingerprint);
   byId("pause").hidden = byId("abandon").hidden = true;
   say("Everything is sent. The server looks into the files …", 1);
-  const job = await call("POST", "/v1/jobs", { body: spec(uploadId), headers: { "Idempotency-Key": key() }, stay: true });
+  let job = await call("POST", "/v1/jobs", { body: spec(uploadId), headers: { "Idempotency-Key": key() }, stay: true });
+  while (job.state === "checking") {
+    await new Promise((resolve) => setTimeout(resolve, CHECK_MS));
+    job = await call("GET", `/v1/jobs/${job.id}`, { stay: true });
+  }
   if (job.state !== "rejected") {
     location.assign(`/jobs/${job.id}`);
     return;

@@ -1,4 +1,5 @@
-"""Processes that the all-in-one command starts: they die with it, and are started again when they die first."""
+"""Child processes of server and worker: they die with their parent, start again when they die first, and how one ended
+is put into words."""
 
 from __future__ import annotations
 
@@ -13,16 +14,18 @@ from contextlib import suppress
 
 import structlog
 
-PR_SET_PDEATHSIG = 1
+PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
 RESTART_SECONDS = (1.0, 2.0, 5.0, 10.0, 30.0)  # pauses before further starts of a child that keeps dying
 STEADY_SECONDS = 60.0  # a child that lived this long starts again at the shortest pause
 
 log = structlog.get_logger("advtex.children")
 
 
-class Child:
-    """One process. All methods are called from the main thread: on Linux the death signal is tied to the thread that
-    started the process."""
+class Supervised:
+    """One process that is kept alive. All methods are called from the main thread (`die_with_parent`).
+
+    stdin: what it is told at each start. stop_seconds: how long it may take to end; None for as long as it likes.
+    """
 
     def __init__(
         self,
@@ -31,7 +34,7 @@ class Child:
         environment: Mapping[str, str],
         *,
         stdin: Callable[[], str] | None = None,
-        stop_seconds: float,
+        stop_seconds: float | None = None,
     ) -> None:
         self.name = name
         self._command = list(command)
@@ -52,6 +55,7 @@ class Child:
     def start(self) -> None:
         """Start it. Its output goes to this process's stderr, so that stdout stays for machine-readable lines."""
         self._asked = False
+        parent = os.getpid()
         self._process = subprocess.Popen(
             self._command,
             env=self._environment,
@@ -59,7 +63,7 @@ class Child:
             stdout=sys.stderr.fileno(),
             stderr=sys.stderr.fileno(),
             start_new_session=True,  # Ctrl-C reaches this process only, which stops its children in order
-            preexec_fn=_die_with(os.getpid()),
+            preexec_fn=lambda: die_with_parent(parent, signal.SIGTERM),
         )
         if self._stdin is not None:
             assert self._process.stdin is not None
@@ -74,10 +78,10 @@ class Child:
             return
         now = time.monotonic()
         if self._next_start == 0.0:
-            self._failures = 0 if now - self._started > STEADY_SECONDS else self._failures + 1
-            pause = RESTART_SECONDS[min(self._failures, len(RESTART_SECONDS)) - 1] if self._failures else 0.0
+            self._failures = 1 if now - self._started > STEADY_SECONDS else self._failures + 1
+            pause = RESTART_SECONDS[min(self._failures, len(RESTART_SECONDS)) - 1]
             self._next_start = now + pause
-            log.warning("died, starts again", child=self.name, exit_code=self._process.returncode, pause=pause)
+            log.warning("starts again", child=self.name, died=how_it_ended(self._process.returncode), pause=pause)
         if now >= self._next_start:
             self._next_start = 0.0
             self.start()
@@ -101,13 +105,28 @@ class Child:
         log.info("stopped", child=self.name, exit_code=self._process.returncode)
 
 
-def _die_with(parent: int) -> Callable[[], None]:
-    prctl = getattr(ctypes.CDLL(None), "prctl", None)  # Linux has it
+def die_with_parent(parent_pid: int, signum: signal.Signals) -> None:
+    """Have the kernel (Linux) send `signum` to this process when its parent ends.
 
-    def prepare() -> None:
-        if prctl is not None:
-            prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
-        if os.getppid() != parent:  # it died before the call above
-            os._exit(1)
+    The kernel watches the thread that made this process, so parents start children from a thread that lives as long
+    as they do. If the parent was gone before the call, this process exits at once.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(PR_SET_PDEATHSIG, int(signum), 0, 0, 0) != 0:
+        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG) failed")
+    if os.getppid() != parent_pid:
+        os._exit(1)
 
-    return prepare
+
+def how_it_ended(code: int) -> str:
+    """How a process ended, for people, as the end of a sentence about it: its return code as `subprocess` gives it."""
+    if code >= 0:
+        return f"ended without a result (exit code {code})"
+    known = {signal.SIGKILL: "was killed (out of memory?)", signal.SIGSEGV: "crashed in native code"}
+    try:
+        signum = signal.Signals(-code)
+    except ValueError:
+        return f"was ended by signal {-code}"
+    return f"{known.get(signum, 'was ended')}: {signum.name}"

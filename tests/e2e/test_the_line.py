@@ -158,7 +158,7 @@ def test_ctrl_c_leaves_the_job_alone(service: LiveService, scan: Path) -> None:
         process.send_signal(signal.SIGINT)
         _, notes = process.communicate(timeout=10)
         assert process.returncode == 130, notes
-        assert next(client.list_jobs()).state is JobState.queued
+        wait_until(lambda: next(client.list_jobs()).state is JobState.queued)
 
 
 def test_the_worker_leaves_when_asked(service: LiveService, scan: Path) -> None:

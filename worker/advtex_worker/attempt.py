@@ -288,7 +288,8 @@ class Attempt:
 
     def _conclude(self, ended: FinishedEvent | FailedEvent | StoppedEvent | None, code: int) -> None:
         records, job_id, number = self._store.records, self._job_id, self._number
-        self._log.info("runner ended", ending=ended.kind if ended else how_it_ended(code), asked=self._keeper.ending)
+        sentence = f"the engine's process {how_it_ended(code)}"
+        self._log.info("runner ended", ending=ended.kind if ended else sentence, asked=self._keeper.ending)
         if self._keeper.ending is Ending.lost:
             return
         self._keeper.beat()  # the newest progress is recorded before the end
@@ -307,7 +308,6 @@ class Attempt:
         elif self._keeper.ending or isinstance(ended, StoppedEvent):
             self._give_back()
         else:
-            sentence = f"the engine's process {how_it_ended(code)}"
             told = f"{tail.rstrip()}\n{sentence}\n".lstrip()
             state = self._record(lambda: records.lost(job_id, number, log_tail=told))
             self._log.warning("runner died", reason=sentence, job_is=state)

@@ -17,9 +17,10 @@ from advtex_server.serving import serve as run_server
 from advtex_server.serving import up as run_all
 from advtex_server.settings import ServerSettings
 from advtex_store.accounts import SCOPES, Accounts
-from advtex_store.database import Database, upgrade_database
-from advtex_store.errors import RecordNotFound
+from advtex_store.database import Database, migrate_database, upgrade_database
+from advtex_store.errors import RecordNotFound, SchemaRefused
 from advtex_store.logs import configure_logs
+from advtex_store.schema import revisions
 from advtex_store.store import open_store
 
 app = typer.Typer(
@@ -69,6 +70,19 @@ def doctor() -> None:
         typer.echo(f"{'ok  ' if check.ok else 'FAIL'} {check.name}{': ' if check.message else ''}{check.message}")
     if any(not check.ok and check.essential for check in found):
         raise typer.Exit(1)
+
+
+@app.command()
+def migrate(
+    to: Annotated[
+        str | None, typer.Option(help="an earlier schema, for a rollback; what only later ones know is lost")
+    ] = None,
+) -> None:
+    """Bring the database's schema up to date, as every server does when it starts, or down again."""
+    newest = revisions()[-1]
+    with _told(SchemaRefused, ValueError):
+        before = migrate_database(ServerSettings().database, to or newest)
+    typer.echo(f"the schema was {before or 'empty'} and is {to or newest}")
 
 
 @keys.command("create")
@@ -124,7 +138,7 @@ def list_keys() -> None:
 @keys.command("revoke")
 def revoke_key(key_id: str) -> None:
     """Refuse a key from now on. Give its id, the part between the two underscores."""
-    with _known_key():
+    with _told(RecordNotFound):
         _accounts().revoke_key(key_id)
 
 
@@ -134,14 +148,14 @@ def rotate_key(
     keep_hours: Annotated[float, typer.Option(min=0, help="how long the old key goes on working")] = 0,
 ) -> None:
     """Replace a key by a new one that sees and may do the same, and print it."""
-    with _known_key():
+    with _told(RecordNotFound):
         typer.echo(_accounts().rotate_key(key_id, keep_hours * 3600))
 
 
 @keys.command("limit")
 def limit_key(key_id: str, max_active_jobs: MaxActiveJobs = None, max_bytes: MaxBytes = None) -> None:
     """Set both limits of a key; what is left out is not limited."""
-    with _known_key():
+    with _told(RecordNotFound):
         _accounts().set_quota(key_id, max_active_jobs, max_bytes)
 
 
@@ -152,27 +166,26 @@ def main() -> None:
 
 def _accounts() -> Accounts:
     settings = ServerSettings()
-    upgrade_database(settings.database)
+    with _told(SchemaRefused):
+        upgrade_database(settings.database)
     return Accounts(Database(settings.database))
 
 
 @contextmanager
-def _known_key() -> Iterator[None]:
+def _told(*errors: type[Exception]) -> Iterator[None]:
+    """What these say, instead of their traceback; exit code 1."""
     try:
         yield
-    except RecordNotFound as error:
-        typer.echo(str(error), err=True)
+    except errors as error:
+        typer.echo(f"advtex-server: {error}", err=True)
         raise typer.Exit(1) from None
 
 
 def _guarded(
     command: Callable[[ServerSettings, str, int], None], settings: ServerSettings, host: str, port: int
 ) -> None:
-    try:
+    with _told(SetupError, SchemaRefused):
         command(settings, host, port)
-    except SetupError as error:
-        typer.echo(f"advtex-server: {error}", err=True)
-        raise typer.Exit(1) from None
 
 
 if __name__ == "__main__":

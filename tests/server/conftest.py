@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -18,6 +19,8 @@ from fastapi.routing import APIRoute
 
 from advtex_server.app import create_app
 from advtex_server.settings import ServerSettings
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
 QUICK: dict[str, Any] = {
     "redis_url": "redis://127.0.0.1:1/0",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
@@ -17,11 +18,12 @@ from advtex_server.serving import serve as run_server
 from advtex_server.serving import up as run_all
 from advtex_server.settings import ServerSettings
 from advtex_store.accounts import SCOPES, Accounts
+from advtex_store.consistency import Disagreement, disagreements
 from advtex_store.database import Database, migrate_database, upgrade_database
 from advtex_store.errors import RecordNotFound, SchemaRefused
 from advtex_store.logs import configure_logs
 from advtex_store.schema import revisions
-from advtex_store.store import open_store
+from advtex_store.store import Store, open_store
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -31,6 +33,8 @@ app = typer.Typer(
 )
 keys = typer.Typer(no_args_is_help=True, help="API keys.")
 app.add_typer(keys, name="keys")
+
+NAMED = 5  # of each kind of what is wrong
 
 Host = Annotated[str, typer.Option(help="address to listen on")]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one")]
@@ -60,16 +64,21 @@ def serve(host: Host = "0.0.0.0", port: Port = 8000) -> None:  # noqa: S104  a s
 
 
 @app.command()
-def doctor() -> None:
-    """Say what works and what does not; exit code 1 if work cannot be accepted."""
+def doctor(
+    repair: Annotated[bool, typer.Option("--repair", help="mend what rows and blobs disagree on, and say how")] = False,
+) -> None:
+    """Say what works and what does not, and where rows and blobs disagree. Exit code 1 if work cannot be accepted, 3 if
+    they disagree on something that is not mended."""
     settings = ServerSettings()
     store = open_store(settings)
     found = checks(store, settings)
-    store.close()
     for check in found:
-        typer.echo(f"{'ok  ' if check.ok else 'FAIL'} {check.name}{': ' if check.message else ''}{check.message}")
-    if any(not check.ok and check.essential for check in found):
-        raise typer.Exit(1)
+        _say(check.ok, check.name, check.message)
+    broken = any(not check.ok and check.essential for check in found)
+    left = 0 if broken else _consistency(store, repair)
+    store.close()
+    if broken or left:
+        raise typer.Exit(1 if broken else 3)
 
 
 @app.command()
@@ -169,6 +178,28 @@ def _accounts() -> Accounts:
     with _told(SchemaRefused):
         upgrade_database(settings.database)
     return Accounts(Database(settings.database))
+
+
+def _consistency(store: Store, repair: bool) -> int:
+    """-> how much rows and blobs still disagree on"""
+    kinds: dict[str, list[Disagreement]] = defaultdict(list)
+    for one in disagreements(store):
+        if repair and one.mend is not None:
+            typer.echo(f"mend {one.kind} {one.item}: {one.message} -> {one.mend()}")
+        else:
+            kinds[one.kind].append(one)
+    for kind, ones in kinds.items():
+        told = [f"{one.item}: {one.message}" for one in ones[:NAMED]]
+        more = f"; and {len(ones) - NAMED} more" if len(ones) > NAMED else ""
+        remedy = "" if ones[0].mend is None else " (--repair mends it)"
+        _say(False, kind, f"{len(ones)}{remedy}: {'; '.join(told)}{more}")
+    if not kinds:
+        _say(True, "rows and blobs", "")
+    return sum(map(len, kinds.values()))
+
+
+def _say(ok: bool, name: str, message: str) -> None:
+    typer.echo(f"{'ok  ' if ok else 'FAIL'} {name}{': ' if message else ''}{message}")
 
 
 @contextmanager

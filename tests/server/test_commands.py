@@ -20,11 +20,14 @@ from click.testing import Result
 from databases import give_revision
 from typer.testing import CliRunner
 
+from advtex_contract.jobs import JobSpec
 from advtex_server import embedded
 from advtex_server.children import Child
 from advtex_server.embedded import SetupError, free_port, only_one, redis_binary, write_private
 from advtex_server.main import app
 from advtex_store.schema import revisions
+from advtex_store.settings import StoreSettings
+from advtex_store.store import open_store
 
 COMMAND = [sys.executable, "-m", "advtex_server.main"]
 
@@ -236,6 +239,24 @@ def test_the_schema_goes_up_and_down(tmp_path: Path, run: Callable[..., Result])
     failed = run(tmp_path, "migrate", "--to", "7")
     assert (failed.exit_code, failed.stdout) == (1, "")
     assert "there is no schema '7': this release knows 0001" in failed.stderr
+
+
+def test_doctor_mends_what_rows_and_blobs_disagree_on(tmp_path: Path, run: Callable[..., Result]) -> None:
+    run(tmp_path, "migrate")
+    assert "ok   rows and blobs" in run(tmp_path, "doctor").stdout
+    store = open_store(StoreSettings(data_dir=tmp_path))
+    upload = store.uploads.create("me", 3)
+    store.uploads.finish(upload.id, "ab" * 32)
+    job = store.submissions.create_job("me", JobSpec(upload_id=upload.id)).id
+    found = run(tmp_path, "doctor")
+    assert found.exit_code == 3
+    assert f"FAIL scans: 1 (--repair mends it): {job}: it waits for a scan whose bytes are gone" in found.stdout
+    assert store.records.job(job).state == "queued"
+    mended = run(tmp_path, "doctor", "--repair")
+    assert mended.exit_code == 0
+    assert f"mend scans {job}: " in mended.stdout
+    assert store.records.job(job).state == "failed"
+    store.close()
 
 
 def test_a_server_refuses_a_schema_that_it_does_not_know_with_a_sentence(

@@ -10,7 +10,8 @@ from sqlalchemy import text
 from sqlalchemy.exc import SQLAlchemyError
 
 from advtex_server.settings import ServerSettings
-from advtex_store.errors import StoreError
+from advtex_store.errors import SchemaRefused, StoreError
+from advtex_store.schema import Schema
 from advtex_store.store import Store
 from advtex_store.troubles import ROUNDS
 
@@ -35,10 +36,17 @@ def checks(store: Store, settings: ServerSettings) -> list[Check]:
 def _database(store: Store) -> Check:
     try:
         with store.database.read() as session:
-            session.execute(text("select id from jobs limit 1"))
+            schema = Schema.of(session.connection())
+            schema.check()
+            if schema.behind is None:
+                session.execute(text("select id from jobs limit 1"))
         blocked = store.database.blocked()
+    except SchemaRefused as error:
+        return Check("database", False, True, str(error))
     except (SQLAlchemyError, sqlite3.Error) as error:
         return Check("database", False, True, f"the database does not answer: {_first_line(error)}")
+    if schema.behind is not None:
+        return Check("database", False, True, schema.behind)
     if blocked is not None:
         return Check("database", False, True, f"{blocked}: if it is frozen, let it go on or end it")
     return Check("database", True, True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
@@ -18,10 +19,12 @@ from advtex_server.serving import serve as run_server
 from advtex_server.serving import up as run_all
 from advtex_server.settings import ServerSettings
 from advtex_store.accounts import SCOPES, Accounts
-from advtex_store.database import Database, upgrade_database
-from advtex_store.errors import RecordNotFound
+from advtex_store.consistency import Disagreement, disagreements
+from advtex_store.database import Database, migrate_database, upgrade_database
+from advtex_store.errors import RecordNotFound, SchemaRefused
 from advtex_store.logs import configure_logs
-from advtex_store.store import open_store
+from advtex_store.schema import revisions
+from advtex_store.store import Store, open_store
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -31,6 +34,8 @@ app = typer.Typer(
 )
 keys = typer.Typer(no_args_is_help=True, help="API keys.")
 app.add_typer(keys, name="keys")
+
+NAMED = 5  # of each kind of what is wrong
 
 
 def _print_version(asked: bool) -> None:
@@ -76,16 +81,34 @@ def serve(host: Host = "0.0.0.0", port: Port = 8000) -> None:  # noqa: S104  a s
 
 
 @app.command()
-def doctor() -> None:
-    """Say what works and what does not; exit code 1 if work cannot be accepted."""
+def doctor(
+    repair: Annotated[bool, typer.Option("--repair", help="mend what rows and blobs disagree on, and say how")] = False,
+) -> None:
+    """Say what works and what does not, and where rows and blobs disagree. Exit code 1 if work cannot be accepted, 3 if
+    they disagree on something that is not mended."""
     settings = ServerSettings()
     store = open_store(settings)
     found = checks(store, settings)
-    store.close()
     for check in found:
-        typer.echo(f"{'ok  ' if check.ok else 'FAIL'} {check.name}{': ' if check.message else ''}{check.message}")
-    if any(not check.ok and check.essential for check in found):
-        raise typer.Exit(1)
+        _say(check.ok, check.name, check.message)
+    broken = any(not check.ok and check.essential for check in found)
+    left = 0 if broken else _consistency(store, repair)
+    store.close()
+    if broken or left:
+        raise typer.Exit(1 if broken else 3)
+
+
+@app.command()
+def migrate(
+    to: Annotated[
+        str | None, typer.Option(help="an earlier schema, for a rollback; what only later ones know is lost")
+    ] = None,
+) -> None:
+    """Bring the database's schema up to date, as every server does when it starts, or down again."""
+    newest = revisions()[-1]
+    with _told(SchemaRefused, ValueError):
+        before = migrate_database(ServerSettings().database, to or newest)
+    typer.echo(f"the schema was {before or 'empty'} and is {to or newest}")
 
 
 @keys.command("create")
@@ -141,7 +164,7 @@ def list_keys() -> None:
 @keys.command("revoke")
 def revoke_key(key_id: str) -> None:
     """Refuse a key from now on. Give its id, the part between the two underscores."""
-    with _known_key():
+    with _told(RecordNotFound):
         _accounts().revoke_key(key_id)
 
 
@@ -151,14 +174,14 @@ def rotate_key(
     keep_hours: Annotated[float, typer.Option(min=0, help="how long the old key goes on working")] = 0,
 ) -> None:
     """Replace a key by a new one that sees and may do the same, and print it."""
-    with _known_key():
+    with _told(RecordNotFound):
         typer.echo(_accounts().rotate_key(key_id, keep_hours * 3600))
 
 
 @keys.command("limit")
 def limit_key(key_id: str, max_active_jobs: MaxActiveJobs = None, max_bytes: MaxBytes = None) -> None:
     """Set both limits of a key; what is left out is not limited."""
-    with _known_key():
+    with _told(RecordNotFound):
         _accounts().set_quota(key_id, max_active_jobs, max_bytes)
 
 
@@ -169,27 +192,48 @@ def main() -> None:
 
 def _accounts() -> Accounts:
     settings = ServerSettings()
-    upgrade_database(settings.database)
+    with _told(SchemaRefused):
+        upgrade_database(settings.database)
     return Accounts(Database(settings.database))
 
 
+def _consistency(store: Store, repair: bool) -> int:
+    """-> how much rows and blobs still disagree on"""
+    kinds: dict[str, list[Disagreement]] = defaultdict(list)
+    for one in disagreements(store):
+        if repair and one.mend is not None:
+            typer.echo(f"mend {one.kind} {one.item}: {one.message} -> {one.mend()}")
+        else:
+            kinds[one.kind].append(one)
+    for kind, ones in kinds.items():
+        told = [f"{one.item}: {one.message}" for one in ones[:NAMED]]
+        more = f"; and {len(ones) - NAMED} more" if len(ones) > NAMED else ""
+        remedy = "" if ones[0].mend is None else " (--repair mends it)"
+        _say(False, kind, f"{len(ones)}{remedy}: {'; '.join(told)}{more}")
+    if not kinds:
+        _say(True, "rows and blobs", "")
+    return sum(map(len, kinds.values()))
+
+
+def _say(ok: bool, name: str, message: str) -> None:
+    typer.echo(f"{'ok  ' if ok else 'FAIL'} {name}{': ' if message else ''}{message}")
+
+
 @contextmanager
-def _known_key() -> Iterator[None]:
+def _told(*errors: type[Exception]) -> Iterator[None]:
+    """What these say, instead of their traceback; exit code 1."""
     try:
         yield
-    except RecordNotFound as error:
-        typer.echo(str(error), err=True)
+    except errors as error:
+        typer.echo(f"advtex-server: {error}", err=True)
         raise typer.Exit(1) from None
 
 
 def _guarded(
     command: Callable[[ServerSettings, str, int], None], settings: ServerSettings, host: str, port: int
 ) -> None:
-    try:
+    with _told(SetupError, SchemaRefused):
         command(settings, host, port)
-    except SetupError as error:
-        typer.echo(f"advtex-server: {error}", err=True)
-        raise typer.Exit(1) from None
 
 
 if __name__ == "__main__":

@@ -36,13 +36,14 @@ class _Server(uvicorn.Server):
 
 
 def serve(settings: ServerSettings, host: str, port: int) -> None:
-    """The API with its dispatcher, until a signal comes."""
+    """The API with its dispatcher, until a signal comes. SetupError, SchemaRefused."""
+    upgrade_database(settings.database)
     with _listen(host, port) as listener:
         run(settings, listener, [], lambda: _say_ready(settings, _url(listener)))
 
 
 def up(settings: ServerSettings, host: str, port: int) -> None:
-    """Everything on this machine: Redis, database, one key, one worker, and the API. SetupError."""
+    """Everything on this machine: Redis, database, one key, one worker, and the API. SetupError, SchemaRefused."""
     hide_environment()  # from the worker's runners; where it cannot be hidden, the worker says so
     with only_one(settings.data_dir), _listen(host, port) as listener:
         children = []

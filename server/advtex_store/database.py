@@ -9,12 +9,16 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+import structlog
 from alembic import command
 from alembic.config import Config
 from sqlalchemy import Connection, Engine, create_engine, event, text
 from sqlalchemy.engine import make_url
 from sqlalchemy.orm import Session
 from sqlalchemy.pool import ConnectionPoolEntry
+
+from advtex_store.errors import SchemaRefused
+from advtex_store.schema import MIGRATIONS, Schema, revisions
 
 # A cut line is noticed in seconds, and what it left open is given up: rows that it had locked would block everybody.
 POSTGRES_LINE = {"connect_timeout": 5, "tcp_user_timeout": 10_000, "keepalives_idle": 10, "keepalives_interval": 5}
@@ -23,6 +27,8 @@ SQLITE_POOL = 40
 SQLITE_WAIT = 30  # seconds, for another connection's lock
 WAL_WRITE_LOCK = "120"  # the byte of the -shm file that a writer locks
 MIGRATION_LOCK = 0x61647674  # any constant that only this service uses as a PostgreSQL advisory lock
+
+log = structlog.get_logger("advtex.database")
 
 
 class Database:
@@ -149,15 +155,55 @@ def _begin_sqlite(connection: Connection) -> None:
 
 
 def upgrade_database(url: str) -> None:
-    """Bring the schema up to date; safe when several servers start at once."""
+    """Bring the schema up to date; safe when several servers start at once.
+
+    One that a newer release has added to stays as it is. SchemaRefused for what this release cannot work on.
+    """
+    with _migration(url) as (config, schema):
+        if schema.ahead:
+            log.warning("a newer release has brought the schema up to date", schema=schema.revision)
+        else:
+            command.upgrade(config, "head")
+
+
+def migrate_database(url: str, to: str) -> str | None:
+    """Bring the schema up or down to a revision that this release knows. -> the one that it had.
+
+    Down loses what only later revisions know. SchemaRefused; ValueError for a revision that there is not.
+    """
+    if to not in revisions():
+        raise ValueError(f"there is no schema {to!r}: this release knows {', '.join(revisions())}")
+    with _migration(url) as (config, schema):
+        if schema.ahead:
+            newest = revisions()[-1]
+            raise SchemaRefused(f"only the release that made schema {schema.revision} can take it back to {newest}")
+        (command.downgrade if (schema.revision or "") > to else command.upgrade)(config, to)
+    return schema.revision
+
+
+def read_schema(url: str) -> Schema:
+    """What schema the database has now."""
+    engine = connect(url)
+    try:
+        with engine.connect() as connection:
+            return Schema.of(connection)
+    finally:
+        engine.dispose()
+
+
+@contextmanager
+def _migration(url: str) -> Iterator[tuple[Config, Schema]]:
+    """For one process at a time: what alembic needs, in one transaction."""
     engine = connect(url)
     config = Config()
-    config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
+    config.set_main_option("script_location", str(MIGRATIONS))
     try:
         with engine.connect().execution_options(write=True) as connection, connection.begin():
             if engine.dialect.name == "postgresql":
                 connection.execute(text("select pg_advisory_xact_lock(:lock)"), {"lock": MIGRATION_LOCK})
+            schema = Schema.of(connection)
+            schema.check()
             config.attributes["connection"] = connection
-            command.upgrade(config, "head")
+            yield config, schema
     finally:
         engine.dispose()

@@ -13,7 +13,9 @@ StoreError
 ├── BlobNotFound
 ├── BlobsUnavailable      the storage cannot be reached now
 │   └── BlobsRefused          it answers and refuses: there is no such bucket, or the keys do not open it
-└── NoSpace               the disk is full; nothing was kept
+├── NoSpace               the disk is full; nothing was kept
+├── SchemaRefused         the database was made by a release that this one cannot work with
+└── UnknownOptions        the job asks for what only a newer worker knows
 """
 
 from __future__ import annotations
@@ -73,3 +75,7 @@ class BlobsUnavailable(StoreError):
 
 class BlobsRefused(BlobsUnavailable):
     """The storage answers, and refuses: no retry helps before somebody mends its settings."""
+
+
+class SchemaRefused(StoreError):
+    """The database has a schema that this release does not know."""

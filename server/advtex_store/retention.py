@@ -8,12 +8,13 @@ from advtex_contract.jobs import TERMINAL
 from advtex_store import keys
 from advtex_store.blobs import Blobs
 from advtex_store.database import Database
-from advtex_store.ids import ID
+from advtex_store.ids import ID, created_at
 from advtex_store.models import KEPT, UNPURGED, UNTIDY, JobRow, UploadRow
 from advtex_store.troubles import PURGE, SWEEP, TIDY, Troubles, not_aside
 
 BATCH = 100
 HIDDEN = 1000  # rows at a time
+ORPHAN_SECONDS = 7 * 86400.0  # what has no row is kept so long: time to notice that the database is an older one
 SETTLED_SECONDS = 600.0  # after a job's end; attempts that lost it have noticed by then
 
 
@@ -85,8 +86,9 @@ class Retention:
         """Remove the blobs of uploads and jobs that have no row, or one that is purged. -> how many there were.
 
         Never removes what a row refers to: a row is committed before the first blob below its id is written, and ids do
-        not come back. So an id that was seen among the blobs and then, later, has no row has lost it for good. Folders
-        that are named otherwise are somebody else's.
+        not come back. So an id that was seen among the blobs and then, later, has no row has lost it for good, unless
+        the database is an older one that was put back: what has no row is kept for ORPHAN_SECONDS. Folders that are
+        named otherwise are somebody else's.
         """
         swept = 0
         tables: tuple[tuple[str, type[JobRow] | type[UploadRow]], ...] = ((keys.SCANS, UploadRow), (keys.JOBS, JobRow))
@@ -95,8 +97,11 @@ class Retention:
             for start in range(0, len(found), BATCH):
                 ids = found[start : start + BATCH]
                 with self.database.read() as session:
-                    alive = set(session.scalars(select(table.id).where(table.id.in_(ids), table.purged_at.is_(None))))
-                for orphan in (found_id for found_id in ids if found_id not in alive):
+                    now = self.database.now(session)
+                    rows = session.execute(select(table.id, table.purged_at).where(table.id.in_(ids)))
+                    known = {row_id: purged_at for row_id, purged_at in rows}  # noqa: C416
+                old = {found_id for found_id in ids if now - created_at(found_id) >= ORPHAN_SECONDS}
+                for orphan in (i for i in ids if (known[i] is not None if i in known else i in old)):
                     with self.troubles.of(SWEEP, orphan):
                         if table is UploadRow:
                             self.blobs.drop_partial(keys.scan_key(orphan))
@@ -124,9 +129,13 @@ class Retention:
         with self.database.read() as session:
             if table is UploadRow:
                 upload = session.get(UploadRow, row_id)
-                return upload is not None and upload.purged_at is None and upload.sha256 is None
+                if upload is None:
+                    return self.database.now(session) - created_at(row_id) < ORPHAN_SECONDS
+                return upload.purged_at is None and upload.sha256 is None
             job = session.get(JobRow, row_id)
-            if job is None or job.purged_at is not None:
+            if job is None:
+                return self.database.now(session) - created_at(row_id) < ORPHAN_SECONDS
+            if job.purged_at is not None:
                 return False
             return job.finished_at is None or self.database.now(session) - job.finished_at < SETTLED_SECONDS
 

@@ -17,11 +17,16 @@ import httpx
 import psutil
 import pytest
 from click.testing import Result
+from databases import give_revision
 from typer.testing import CliRunner
 
+from advtex_contract.jobs import JobSpec
 from advtex_server import embedded
 from advtex_server.embedded import SetupError, free_port, only_one, redis_binary, write_private
 from advtex_server.main import app
+from advtex_store.schema import revisions
+from advtex_store.settings import StoreSettings
+from advtex_store.store import open_store
 
 COMMAND = [sys.executable, "-m", "advtex_server.main"]
 
@@ -220,6 +225,56 @@ def test_keys_and_doctor(tmp_path: Path, run: Callable[..., Result]) -> None:
     assert doctor.exit_code == 0
     assert "FAIL redis: Redis does not answer" in doctor.stdout
     assert run(tmp_path / "empty", "doctor").exit_code == 1
+
+
+def test_the_schema_goes_up_and_down(tmp_path: Path, run: Callable[..., Result]) -> None:
+    newest = revisions()[-1]
+    assert run(tmp_path, "migrate").stdout == f"the schema was empty and is {newest}\n"
+    assert run(tmp_path, "migrate", "--to", "0001").stdout == f"the schema was {newest} and is 0001\n"
+    doctor = run(tmp_path, "doctor")
+    assert doctor.exit_code == 1
+    assert f"FAIL database: the database has schema 0001 and this release needs {newest}: start" in doctor.stdout
+    assert run(tmp_path, "keys", "create").exit_code == 0, "brings it up to date"
+    assert run(tmp_path, "migrate").stdout == f"the schema was {newest} and is {newest}\n"
+    failed = run(tmp_path, "migrate", "--to", "7")
+    assert (failed.exit_code, failed.stdout) == (1, "")
+    assert "there is no schema '7': this release knows 0001" in failed.stderr
+
+
+def test_doctor_mends_what_rows_and_blobs_disagree_on(tmp_path: Path, run: Callable[..., Result]) -> None:
+    run(tmp_path, "migrate")
+    assert "ok   rows and blobs" in run(tmp_path, "doctor").stdout
+    store = open_store(StoreSettings(data_dir=tmp_path))
+    upload = store.uploads.create("me", 3)
+    store.uploads.finish(upload.id, "ab" * 32)
+    job = store.submissions.create_job("me", JobSpec(upload_id=upload.id)).id
+    found = run(tmp_path, "doctor")
+    assert found.exit_code == 3
+    assert f"FAIL scans: 1 (--repair mends it): {job}: it waits for a scan whose bytes are gone" in found.stdout
+    assert store.records.job(job).state == "queued"
+    mended = run(tmp_path, "doctor", "--repair")
+    assert mended.exit_code == 0
+    assert f"mend scans {job}: " in mended.stdout
+    assert store.records.job(job).state == "failed"
+    store.close()
+
+
+def test_a_server_refuses_a_schema_that_it_does_not_know_with_a_sentence(
+    tmp_path: Path, run: Callable[..., Result]
+) -> None:
+    run(tmp_path, "migrate")
+    give_revision(f"sqlite:///{tmp_path}/advtex.db", "9901")
+    environment = {**os.environ, "ADVTEX_DATA_DIR": str(tmp_path), "ADVTEX_REDIS_URL": "redis://127.0.0.1:1/0"}
+    for command in ("serve", "up"):
+        started = [*COMMAND, command, "--port", "0"]
+        ended = subprocess.run(started, env=environment, capture_output=True, text=True, timeout=30)
+        assert ended.returncode == 1
+        assert ended.stderr.startswith("advtex-server: the database has schema 9901, which this release does not know")
+        assert "Traceback" not in ended.stderr
+    for refused in (("keys", "create"), ("migrate",), ("doctor",)):
+        failed = run(tmp_path, *refused)
+        assert failed.exit_code == 1
+        assert "the database has schema 9901, which this release does not know" in failed.output
 
 
 def test_keys_are_limited_and_rotated(tmp_path: Path, run: Callable[..., Result]) -> None:

@@ -19,6 +19,7 @@ from advtex_store import keys
 from advtex_store.blobs import FolderBlobs
 from advtex_store.errors import BlobsUnavailable
 from advtex_store.models import JobRow
+from advtex_store.retention import ORPHAN_SECONDS
 from advtex_store.store import Store, open_store
 from advtex_store.troubles import ASIDE_SECONDS, ROUNDS
 
@@ -146,13 +147,14 @@ def test_blobs_that_cannot_be_deleted_keep_no_others(world: Any, guarded: set[st
 
 
 def test_orphans_are_swept_past_one_that_cannot_be(world: Any, guarded: set[str]) -> None:
-    store, dispatcher, _clock = world
+    store, dispatcher, clock = world
     orphans = [submit(store) for _ in range(3)]
     with store.database.write() as session:
         for orphan in orphans:
             session.delete(session.get(JobRow, orphan))
     for orphan in orphans:
         store.blobs.put(keys.checkpoints_prefix(orphan) + "1", b"x")
+    clock[0] += ORPHAN_SECONDS
     guarded.add(orphans[1])
     assert dispatcher.retention.sweep() == 2
     assert [row.item for row in store.troubles.all()] == [orphans[1]]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import psycopg
 import pytest
 
 from advtex_contract.jobs import JobSpec
@@ -69,6 +71,19 @@ class Bench:
     def state(self, job_id: str) -> tuple[str, int]:
         row = self.records.job(job_id)
         return row.state, row.attempt
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def empty_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
+    """A database without a schema, of either kind."""
+    if request.param == "sqlite":
+        yield f"sqlite:///{tmp_path}/empty.db"
+        return
+    server, name = str(request.getfixturevalue("postgres_server")), "empty_" + os.urandom(6).hex()
+    with psycopg.connect(server + "postgres", autocommit=True) as connection:
+        connection.execute(f"create database {name}")
+        yield f"{server}{name}".replace("postgresql:", "postgresql+psycopg:")
+        connection.execute(f"drop database {name} with (force)")
 
 
 @pytest.fixture

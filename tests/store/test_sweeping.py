@@ -22,7 +22,7 @@ from advtex_store.ids import new_id
 from advtex_store.models import JobRow, UploadRow
 from advtex_store.partials import Partial, Unpublished
 from advtex_store.results import Results
-from advtex_store.retention import SETTLED_SECONDS, Retention
+from advtex_store.retention import ORPHAN_SECONDS, SETTLED_SECONDS, Retention
 from advtex_store.s3 import S3Blobs
 from advtex_store.s3_partial import MULTIPART_SUFFIX
 
@@ -218,6 +218,7 @@ class World:
         with self.bench.database.write() as session:
             session.query(JobRow).delete()
             session.query(UploadRow).delete()
+        self.bench.clock.now += ORPHAN_SECONDS
         self.retention.sweep()
         for prefix in (keys.SCANS, keys.JOBS):
             assert [*self.blobs.list(prefix), *self.blobs.unpublished(prefix)] == []
@@ -303,7 +304,7 @@ def test_multipart_uploads_whose_writers_died_are_aborted(bench: Any, s3_url: st
     begun, complete, job = bench.uploads.create("me", SIZE).id, bench.finished_upload(), bench.job()
     create = blobs._multipart.create
     kept = [create(keys.scan_key(begun)), create(keys.result_key(job, 1, "a")), create("scans/by hand/x")]
-    for key in (keys.scan_key(new_id(bench.clock.now)), keys.scan_key(complete)):
+    for key in (keys.scan_key(new_id(bench.clock.now - ORPHAN_SECONDS)), keys.scan_key(complete)):
         create(key)
 
     def left() -> list[str]:
@@ -327,8 +328,9 @@ def test_orphans_go_and_everything_else_stays(bench: Any, blobs: Blobs) -> None:
     retention = Retention(bench.database, blobs)
     upload = bench.finished_upload()
     job = bench.job(upload_id=upload)
-    orphan = new_id(bench.clock.now)
-    kept = [keys.scan_key(upload), keys.checkpoint_prefix(job, 1) + "1/0", "scans/not-an-id/x", "elsewhere/x"]
+    orphan, newer = (new_id(bench.clock.now - age) for age in (ORPHAN_SECONDS, ORPHAN_SECONDS - 1))
+    kept = [keys.scan_key(newer), keys.result_manifest_key(newer)]  # of a database that an older one has replaced?
+    kept += [keys.scan_key(upload), keys.checkpoint_prefix(job, 1) + "1/0", "scans/not-an-id/x", "elsewhere/x"]
     lost = [keys.scan_key(orphan), keys.checkpoint_prefix(orphan, 1) + "1/0", keys.result_manifest_key(orphan)]
     for key in kept + lost:
         blobs.put(key, b"x")

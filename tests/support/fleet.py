@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -15,9 +14,10 @@ from types import MappingProxyType
 from urllib.parse import urlsplit, urlunsplit
 
 import httpx
-from live_service import RHYTHM, SUPPORT, process_tree, wait_until
+from live_service import RHYTHM, process_tree, wait_until
 from redis import Redis
 from redis.exceptions import RedisError
+from releases import PRESENT, Release
 from tcp_proxy import TcpProxy
 
 from advtex_server.embedded import free_port, redis_binary
@@ -97,11 +97,12 @@ class Fleet:
         with Redis(port=self.redis_port) as client:
             wait_until(lambda: self.redis.poll() is not None or _answers(client))
 
-    def start_server(self, number: int) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "advtex_server.main", "serve", "--host", "127.0.0.1"]
-        return self._start([*command, "--port", str(self.ports[number])], self._variables(lambda _name, url: url))
+    def start_server(self, number: int, release: Release = PRESENT) -> subprocess.Popen[bytes]:
+        command = [release.python, "-m", "advtex_server.main", "serve", "--host", "127.0.0.1"]
+        variables = self._variables(lambda _name, url: url)
+        return self._start([*command, "--port", str(self.ports[number])], variables, release)
 
-    def start_worker(self, number: int) -> subprocess.Popen[bytes]:
+    def start_worker(self, number: int, release: Release = PRESENT) -> subprocess.Popen[bytes]:
         """Its lines to Redis, database and object storage go through `lines`."""
 
         def through(name: str, url: str) -> str:
@@ -111,7 +112,7 @@ class Fleet:
             return urlunsplit(parts._replace(netloc=f"{parts.netloc.rpartition(':')[0]}:{self.lines[name].port}"))
 
         variables = self._variables(through) | {"ADVTEX_WORK_DIR": str(self.place.data / f"work-{number}")}
-        return self._start([sys.executable, str(SUPPORT / "run_worker.py"), self._engine], variables)
+        return self._start([release.python, str(release.support / "run_worker.py"), self._engine], variables, release)
 
     def stop(self) -> None:
         self.store.close()
@@ -134,8 +135,10 @@ class Fleet:
             **self._given,
         }
 
-    def _start(self, command: list[str], variables: Mapping[str, str]) -> subprocess.Popen[bytes]:
-        path = os.pathsep.join(str(Path(entry).absolute()) for entry in (*sys.path, SUPPORT) if entry)
+    def _start(
+        self, command: list[str], variables: Mapping[str, str], release: Release = PRESENT
+    ) -> subprocess.Popen[bytes]:
+        path = os.pathsep.join(release.path)
         kept = {name: value for name, value in os.environ.items() if not name.startswith(("ADVTEX_", "AWS_"))}
         environment = {**kept, **RHYTHM, **variables, "PYTHONPATH": path, "ADVTEX_ENGINE_JOURNAL": str(self.journal)}
         with (self.redis_log if command[0] == redis_binary() else self.log).open("ab") as log:

@@ -13,7 +13,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from types import FrameType
@@ -25,8 +25,11 @@ from redis.exceptions import RedisError
 from rq import Worker
 from rq.exceptions import StopRequested
 from rq.serializers import JSONSerializer
+from sqlalchemy.exc import SQLAlchemyError
 
 from advtex_scan.version import product_version
+from advtex_store.database import read_schema
+from advtex_store.errors import SchemaRefused
 from advtex_store.logs import configure_logs
 from advtex_store.queue import JobQueue, attempt_of, class_of, connect_redis, queue_name
 from advtex_store.secrecy import hide_environment
@@ -38,6 +41,7 @@ from advtex_worker.tasks import Host, serve_as
 RECONNECT_SECONDS = 2
 HEARTBEAT_SECONDS = 5  # between signs of life in Redis
 RQ_WAIT_MARGIN = 15  # RQ waits so much shorter for a job than its worker's time to live
+SCHEMA_SECONDS = 2.0  # between looks at a schema that is not ready
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 log = structlog.get_logger()
@@ -137,13 +141,36 @@ class JobWorker(Worker):
 
 def serve(host: Host, command: Sequence[str]) -> None:
     """Serve the queue with all slots until SIGTERM or SIGINT. A single one is served here; of several each gets a
-    process, started by `command`."""
+    process, started by `command`. SchemaRefused."""
+    wait_for_schema(host.settings.database, time.sleep)
     slots = find_slots(host.settings)
     if len(slots) > 1:
         log.info("worker begins slots", slots=len(slots))
         supervise(command, slots, host.settings)
     else:
         work(replace(host, settings=settings_of(slots[0], host.settings, 1)), slots[0])
+
+
+def wait_for_schema(url: str, wait: Callable[[float], object]) -> None:
+    """Until the database can be reached and has what this release needs: its servers bring it up to date when they
+    start. SchemaRefused where waiting does not help."""
+    told = ""
+    while True:
+        try:
+            schema = read_schema(url)
+        except SQLAlchemyError as error:
+            reason = f"the database does not answer: {str(error).partition(chr(10))[0]}"
+        else:
+            schema.check()
+            if schema.ahead:
+                log.warning("a newer release has brought the schema up to date", schema=schema.revision)
+            if schema.behind is None:
+                return
+            reason = schema.behind
+        if reason != told:
+            log.warning("worker takes no jobs yet", reason=reason)
+            told = reason
+        wait(SCHEMA_SECONDS)
 
 
 def work(host: Host, slot: Slot) -> None:
@@ -178,7 +205,10 @@ def main() -> None:
     if (reason := hide_environment()) is not None:
         log.warning("runners could read this process's environment, passwords included", reason=reason)
     log.info("worker begins", device=settings.device, threads=settings.threads)
-    serve(Host(settings), [sys.executable, "-m", "advtex_worker.main"])
+    try:
+        serve(Host(settings), [sys.executable, "-m", "advtex_worker.main"])
+    except SchemaRefused as refused:
+        sys.exit(f"advtex-worker: {refused}")
     log.info("worker ends")
 
 

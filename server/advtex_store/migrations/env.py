@@ -1,4 +1,4 @@
-"""Run by alembic inside the transaction that `upgrade_database` opened."""
+"""Run by alembic inside the transaction that `database.py` opened. The rule of the migrations is in `schema.py`."""
 
 from __future__ import annotations
 

@@ -35,6 +35,15 @@ def upgrade() -> None:
     _create_webhooks()
 
 
+def downgrade() -> None:
+    for table in ("deliveries", "webhooks", "tallies"):
+        op.drop_table(table)
+    for column in ("tidied_at", "retention_seconds", "waiting_reason", "memory_bytes", "priority"):
+        op.drop_column("jobs", column)
+    for column in ("max_bytes", "max_active_jobs"):
+        op.drop_column("api_keys", column)
+
+
 def _create_webhooks() -> None:
     op.create_table(
         "webhooks",

@@ -21,3 +21,12 @@ def upgrade() -> None:
     op.add_column("jobs", sa.Column("source", sa.Text(), nullable=True))
     op.add_column("jobs", sa.Column("batch", sa.String(length=255), nullable=True))
     op.create_index("ix_jobs_owner_batch_id", "jobs", ["owner", "batch", "id"], unique=False)
+
+
+def downgrade() -> None:
+    op.drop_index("ix_jobs_owner_batch_id", "jobs")
+    for column in ("batch", "source"):
+        op.drop_column("jobs", column)
+    op.drop_index(op.f("ix_uploads_announced_sha256"), "uploads")
+    for column in ("source", "tus_metadata", "holder", "announced_sha256"):
+        op.drop_column("uploads", column)

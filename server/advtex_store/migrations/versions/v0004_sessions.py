@@ -24,3 +24,8 @@ def upgrade() -> None:
     op.create_index(op.f("ix_sessions_key_id"), "sessions", ["key_id"], unique=False)
     op.create_index(op.f("ix_sessions_expires_at"), "sessions", ["expires_at"], unique=False)
     op.create_index("ix_jobs_owner_updated_at", "jobs", ["owner", "updated_at"], unique=False)
+
+
+def downgrade() -> None:
+    op.drop_index("ix_jobs_owner_updated_at", "jobs")
+    op.drop_table("sessions")

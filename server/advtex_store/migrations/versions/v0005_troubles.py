@@ -22,3 +22,7 @@ def upgrade() -> None:
         sa.Column("last_at", sa.Double(), nullable=False),
         sa.PrimaryKeyConstraint("task", "item"),
     )
+
+
+def downgrade() -> None:
+    op.drop_table("troubles")

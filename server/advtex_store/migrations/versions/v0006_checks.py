@@ -14,3 +14,12 @@ depends_on = None
 def upgrade() -> None:
     op.add_column("jobs", sa.Column("checked_at", sa.Double(), nullable=True))
     op.execute("UPDATE jobs SET checked_at = created_at")  # until now a job was made once its scan was checked
+
+
+def downgrade() -> None:
+    # Older releases know no job that is checked: its scan is judged where it is read, by the worker.
+    op.execute(
+        "UPDATE jobs SET state = 'queued', attempt = attempt + 1, worker = NULL, lease_expires_at = NULL, deaths = 0"
+        " WHERE state = 'checking'"
+    )
+    op.drop_column("jobs", "checked_at")

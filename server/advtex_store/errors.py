@@ -14,8 +14,7 @@ StoreError
 ├── BlobsUnavailable      the storage cannot be reached now
 │   └── BlobsRefused          it answers and refuses: there is no such bucket, or the keys do not open it
 ├── NoSpace               the disk is full; nothing was kept
-├── SchemaRefused         the database was made by a release that this one cannot work with
-└── UnknownOptions        the job asks for what only a newer worker knows
+└── SchemaRefused         the database was made by a release that this one cannot work with
 """
 
 from __future__ import annotations

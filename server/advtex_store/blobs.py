@@ -1,6 +1,5 @@
-"""Scans, checkpoints and results: a local folder, or an S3 bucket through obstore.
+"""Scans, checkpoints and results: a local folder, or a bucket of S3.
 
-The folder is our own code because obstore's is not durable: its put renames, and calls no fsync at all (strace, 0.12).
 Nothing is ever half there: a blob is written aside, made durable (fsync of file and folders, or a completed multipart
 upload) and only then gets its name. Bytes pass in chunks; no blob is ever whole in memory except through `get`.
 Names are in `keys.py`. All calls block; the server makes them in threads.

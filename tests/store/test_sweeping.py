@@ -125,9 +125,9 @@ class World:
         if isinstance(self.blobs, S3Blobs):
             upload, job = self.pick(self.uploads), self.pick(self.jobs)
             self.bench.uploads.upload(upload)
-            self.blobs._multipart.create(keys.scan_key(upload))
+            self.blobs.bucket.begin(keys.scan_key(upload))
             self.bench.records.job(job)
-            self.blobs._multipart.create(keys.result_key(job, 1, "texture.png"))
+            self.blobs.bucket.begin(keys.result_key(job, 1, "texture.png"))
 
     def finish_upload(self) -> None:
         upload = self.pick(self.uploads)
@@ -301,13 +301,13 @@ def test_multipart_uploads_whose_writers_died_are_aborted(bench: Any, s3_url: st
     assert isinstance(blobs, S3Blobs)
     retention = Retention(bench.database, blobs)
     begun, complete, job = bench.uploads.create("me", SIZE).id, bench.finished_upload(), bench.job()
-    create = blobs._multipart.create
+    create = blobs.bucket.begin
     kept = [create(keys.scan_key(begun)), create(keys.result_key(job, 1, "a")), create("scans/by hand/x")]
     for key in (keys.scan_key(new_id(bench.clock.now)), keys.scan_key(complete)):
         create(key)
 
     def left() -> list[str]:
-        begun = blobs._multipart.begun(keys.SCANS) + blobs._multipart.begun(keys.JOBS)
+        begun = [*blobs.bucket.begun("scans"), *blobs.bucket.begun("jobs")]
         return sorted(upload_id for _, upload_id in begun)
 
     assert retention.sweep() == 2

@@ -9,8 +9,8 @@ from pathlib import Path
 from advtex_store.blobs import BlobInfo, Blobs, check_key, check_prefix
 from advtex_store.bucket import Bucket, FoundObject
 from advtex_store.errors import BlobNotFound
-from advtex_store.partials import Partial, PublishedPartial, Unpublished
-from advtex_store.s3_partial import MULTIPART_SUFFIX, S3Partial
+from advtex_store.partials import Hold, Partial, Unpublished
+from advtex_store.s3_partial import MULTIPART_SUFFIX, S3Partial, drop
 
 
 class S3Blobs(Blobs):
@@ -44,17 +44,8 @@ class S3Blobs(Blobs):
     def delete(self, key: str) -> None:
         self.bucket.delete(check_key(key))
 
-    def resume(self, key: str, size: int, offset: int) -> Partial:
-        if self.is_published(key, size):
-            return PublishedPartial(offset)
-        return S3Partial(self, key, size, offset)
-
     def drop_partial(self, key: str) -> None:
-        with suppress(BlobNotFound):
-            self.bucket.abort(key, self.get(key + MULTIPART_SUFFIX).decode())
-        for info in self.list(key.rpartition("/")[0] + "/"):
-            if info.key.startswith(f"{key}."):
-                self.delete(info.key)
+        drop(self.bucket, check_key(key))
 
     def unpublished(self, prefix: str) -> Iterator[Unpublished]:
         for key, upload_id in self.bucket.begun(check_prefix(prefix)):
@@ -73,6 +64,9 @@ class S3Blobs(Blobs):
     def check(self) -> None:
         for _ in self.bucket.folders("jobs/none"):
             return
+
+    def _resume(self, key: str, size: int, offset: int, hold: Hold) -> Partial:
+        return S3Partial(self.bucket, key, size, offset, hold)
 
     def _publish(self, path: Path, key: str) -> None:
         self.bucket.put_file(key, path)

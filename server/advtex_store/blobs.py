@@ -224,7 +224,7 @@ class BlobWriter:
 
     @property
     def sha256(self) -> str:
-        """Of the bytes so far."""
+        """The digest of the bytes so far, in hexadecimal."""
         return self._digest.hexdigest()
 
     def commit(self) -> Written:

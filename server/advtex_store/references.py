@@ -132,7 +132,7 @@ def _resolved(place: _Place) -> _Place:
 
 
 def _check_readable(path: Path, url: str) -> None:
-    """Of a folder, that it can be listed and entered; of a file, that it can be opened."""
+    """Whether a folder can be listed and entered, or a file opened. BlobNotFound, ReferenceUnreadable."""
     try:
         if path.is_dir():
             next(path.iterdir(), path).stat()

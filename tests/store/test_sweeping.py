@@ -129,7 +129,7 @@ class World:
         return row
 
     def die_in_mid_request(self) -> None:
-        """Of S3: between the multipart upload and the blob that has its id; and in the middle of a result."""
+        """S3 only: between the multipart upload and the blob that has its id; and in the middle of a result."""
         if isinstance(self.blobs, S3Blobs):
             upload, job = self.pick(self.uploads), self.pick(self.jobs)
             self.bench.uploads.upload(upload)

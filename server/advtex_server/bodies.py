@@ -50,7 +50,7 @@ class OpenBody:
 
 
 class OpenBodies:
-    """Of this server process. A request in another one is superseded by the row that it has lost."""
+    """The bodies that arrive in this server process. A request in another one learns of its end from the row."""
 
     def __init__(self) -> None:
         self._open: dict[str, OpenBody] = {}

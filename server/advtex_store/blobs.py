@@ -1,6 +1,5 @@
-"""Scans, checkpoints and results: a local folder, or an S3 bucket through obstore.
+"""Scans, checkpoints and results: a local folder, or a bucket of S3.
 
-The folder is our own code because obstore's is not durable: its put renames, and calls no fsync at all (strace, 0.12).
 Nothing is ever half there: a blob is written aside, made durable (fsync of file and folders, or a completed multipart
 upload) and only then gets its name. Bytes pass in chunks; no blob is ever whole in memory except through `get`.
 Names are in `keys.py`. All calls block; the server makes them in threads.
@@ -8,6 +7,7 @@ Names are in `keys.py`. All calls block; the server makes them in threads.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 import re
@@ -24,7 +24,7 @@ from urllib.parse import unquote, urlsplit
 
 from advtex_store.errors import BlobNotFound, BlobsUnavailable
 from advtex_store.files import fsync_dir, translated
-from advtex_store.partials import FolderPartial, Partial, PublishedPartial, Unpublished
+from advtex_store.partials import FolderPartial, Hold, Partial, PublishedPartial, Unpublished
 
 CHUNK = 1 << 20
 PLACE_ATTEMPTS = 100
@@ -132,9 +132,20 @@ class Blobs(ABC):
         for info in list(self.list(prefix)):
             self.delete(info.key)
 
-    @abstractmethod
-    def resume(self, key: str, size: int, offset: int) -> Partial:
-        """Go on with a blob of `size` bytes whose first `offset` ones are held; BlobNotFound if they are not."""
+    def resume(self, key: str, size: int, offset: int, hold: Hold) -> Partial:
+        """Go on with a blob of `size` bytes whose first `offset` ones are held; BlobNotFound if they are not.
+
+        Superseded: the row is no longer this holder's.
+        """
+        check_key(key)
+        if not self.is_published(key, size):
+            try:
+                return self._resume(key, size, offset, hold)
+            except BlobNotFound:  # an older request may be giving it its name this moment
+                if not self.is_published(key, size):
+                    raise
+        self.drop_partial(key)  # what was left by one that died right after
+        return PublishedPartial(size)
 
     @abstractmethod
     def drop_partial(self, key: str) -> None:
@@ -178,6 +189,10 @@ class Blobs(ABC):
                     path.unlink()
 
     @abstractmethod
+    def _resume(self, key: str, size: int, offset: int, hold: Hold) -> Partial:
+        """The pieces of a blob that has no name yet."""
+
+    @abstractmethod
     def _publish(self, path: Path, key: str) -> None:
         """Give the durable spool file its name, consuming it or not."""
 
@@ -209,7 +224,7 @@ class BlobWriter:
 
     @property
     def sha256(self) -> str:
-        """Of the bytes so far."""
+        """The digest of the bytes so far, in hexadecimal."""
         return self._digest.hexdigest()
 
     def commit(self) -> Written:
@@ -311,22 +326,19 @@ class FolderBlobs(Blobs):
             self.spool_dir.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=self.spool_dir) as file:
                 file.write(b"x")
+                fcntl.flock(file, fcntl.LOCK_EX)  # as uploads do; some network file systems cannot
         except OSError as error:
             raise BlobsUnavailable(f"the folder {self.root} cannot be written to: {error.strerror}") from error
 
-    def resume(self, key: str, size: int, offset: int) -> Partial:
-        target = self.path(key)
-        path = target.with_name(target.name + PARTIAL_SUFFIX)
-        if not path.exists():
-            if self.is_published(key, size):
-                return PublishedPartial(offset)
-            if offset > 0:
-                raise BlobNotFound(key)
-            self._place(key, lambda _: path.touch())
-        return FolderPartial(path, target, size, offset)
-
     def drop_partial(self, key: str) -> None:
         self.delete(key + PARTIAL_SUFFIX)
+
+    def _resume(self, key: str, size: int, offset: int, hold: Hold) -> Partial:
+        target = self.path(key)
+        path = target.with_name(target.name + PARTIAL_SUFFIX)
+        if offset == 0:
+            self._place(key, lambda _: path.touch())
+        return FolderPartial(path, target, size, offset, hold)
 
     def _publish(self, path: Path, key: str) -> None:
         self._place(key, path.replace)

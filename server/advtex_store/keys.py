@@ -1,13 +1,13 @@
 """Names of all blobs, in one place.
 
     scans/{upload}/scan.zip
-    jobs/{job}/checkpoints/{attempt}/...      stage caches and checkpoint of one attempt
+    jobs/{job}/checkpoints/{attempt}/...      files of one attempt's checkpoints, and the index of its newest one
     jobs/{job}/live/{attempt}.json            what the texture looks like while the attempt makes it
     jobs/{job}/results/{attempt}/...          files that one attempt made
     jobs/{job}/result.json                    the manifest: written last, once, by the attempt that won
 
-A resuming attempt lays the checkpoints of all earlier attempts over one another, oldest first: later files replace
-earlier ones of the same name. An attempt writes below its own number only, so one that lost its lease harms nothing.
+The newest attempt that has an index has the job's checkpoint; its index names files of earlier attempts too, where they
+have not changed since. An attempt writes below its own number only, so one that lost its lease harms nothing.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def job_prefix(job_id: str) -> str:
 
 
 def checkpoints_prefix(job_id: str) -> str:
-    """Of all attempts; the next path segment is the attempt's number."""
+    """What the checkpoints of all attempts lie below; the next path segment is the attempt's number."""
     return f"jobs/{job_id}/checkpoints/"
 
 
@@ -38,7 +38,7 @@ def checkpoint_prefix(job_id: str, attempt: int) -> str:
 
 
 def live_prefix(job_id: str) -> str:
-    """Of all attempts."""
+    """What all attempts show lies below it."""
     return f"jobs/{job_id}/live/"
 
 
@@ -47,7 +47,7 @@ def live_key(job_id: str, attempt: int) -> str:
 
 
 def results_prefix(job_id: str) -> str:
-    """Of all attempts."""
+    """What the results of all attempts lie below."""
     return f"jobs/{job_id}/results/"
 
 

@@ -74,7 +74,8 @@ class UploadRow(Base):
     """A scan: on its way in, complete (`sha256` is set, and only then its blob exists), or one of the operator's that
     stays where it is (`source` is its URL).
 
-    offset: bytes that are durable. holder: the newest request for the bytes; only that one may move the offset.
+    offset: bytes that are durable; all of them from right before the blob gets its name. holder: the newest request for
+    the bytes; only that one may move the offset. kept_by: the request that moved it last.
     announced_sha256: what the client says that the bytes will have; the bytes' own once they are complete.
     tus_metadata: as the client gave it. source: as in its job.
     """
@@ -89,6 +90,7 @@ class UploadRow(Base):
     sha256: Mapped[str | None]
     announced_sha256: Mapped[str | None] = mapped_column(index=True)
     holder: Mapped[str | None]
+    kept_by: Mapped[str | None]
     tus_metadata: Mapped[str] = mapped_column(Text, default="")
     source: Mapped[str | None] = mapped_column(Text)
     created_at: Mapped[float]

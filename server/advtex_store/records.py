@@ -5,14 +5,15 @@ How a worker carries a job (`store = open_store(settings)`; RQ calls `advtex_wor
 1. `claim = store.records.claim(job_id, attempt, worker)`. `StaleAttempt` here means that somebody else has the job or
    that it was canceled: return quietly, it is not an error.
 2. `if store.results.adopt(job_id): return`: an earlier attempt had already finished, only its row was not told.
-3. Fetch the scan: `store.blobs.fetch(claim.scan_key, path)`. Resume: every blob below
-   `keys.checkpoints_prefix(job_id)`, attempts in ascending order, laid over one another (`keys.py`).
+3. Fetch the scan: `store.blobs.fetch(claim.scan_key, path)`. Resume: the files that the index of the newest attempt
+   names (`keys.py`; the worker writes and reads the indexes).
 4. Every half second, and from a thread that does not wait for the engine: `store.live_progress.tell(…)` for those who
    watch, and `lease = store.records.lease(job_id, attempt)`, which writes nothing; every few seconds instead of that
    `store.records.heartbeat(job_id, attempt, progress=…, reached=…)`. `lease.cancel_requested` -> stop the engine with a
    checkpoint. `StaleAttempt` -> the lease is lost: stop at once, upload nothing more. A heartbeat that fails because
    the database is away is no loss: try again until `lease_seconds` have passed since the last good one.
-5. New checkpoint files: `store.blobs.upload(path, keys.checkpoint_prefix(job_id, attempt) + name)`.
+5. A checkpoint: its new files below `keys.checkpoint_prefix(job_id, attempt)`, under names that are never used again,
+   then the index that names them, in one go; only then go files that no index of this attempt names any more.
 6. The end, one of
    - `store.results.commit(job_id, attempt, {name: path}, warnings)`: uploads the files, writes the manifest once,
      marks the job `succeeded`;

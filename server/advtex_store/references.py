@@ -19,7 +19,7 @@ from advtex_store.errors import BlobNotFound, BlobsRefused, ReferenceRefused, Re
 from advtex_store.files import translated
 
 if TYPE_CHECKING:
-    from advtex_store.s3 import BucketReader, FoundObject
+    from advtex_store.bucket import Bucket, FoundObject
 
 _BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
 
@@ -68,10 +68,10 @@ class References:
         except BlobsRefused as error:
             raise _unreadable(url, error) from error
         alone = found[0].size if found[0].name == name else None
-        inside = {key.removeprefix(f"{name}/"): size for key, size, _ in found}
+        inside = {key.removeprefix(f"{name}/"): size for key, size, *_ in found}
 
         def read(file: str, start: int, end: int) -> bytes:
-            return bucket.read(f"{name}/{file}" if file else name, start, end)
+            return bucket.get(f"{name}/{file}" if file else name, start, end)
 
         return RemoteScan(name, inside if alone is None else alone, read)
 
@@ -132,7 +132,7 @@ def _resolved(place: _Place) -> _Place:
 
 
 def _check_readable(path: Path, url: str) -> None:
-    """Of a folder, that it can be listed and entered; of a file, that it can be opened."""
+    """Whether a folder can be listed and entered, or a file opened. BlobNotFound, ReferenceUnreadable."""
     try:
         if path.is_dir():
             next(path.iterdir(), path).stat()
@@ -149,15 +149,15 @@ def _unreadable(url: str, error: BlobsRefused) -> ReferenceUnreadable:
     return ReferenceUnreadable(f"{url} cannot be read by the service: {error}")
 
 
-def _found(place: _Place, url: str) -> tuple[BucketReader, str, list[FoundObject]]:
+def _found(place: _Place, url: str) -> tuple[Bucket, str, list[FoundObject]]:
     """The bucket's part that holds the scan, the scan's name there, and its objects."""
-    from advtex_store.s3 import BucketReader
+    from advtex_store.bucket import Bucket
 
     if not place.parts:
         raise ReferenceRefused(f"{url} is a whole bucket: name a scan in it")
     *parents, name = place.parts
-    bucket = BucketReader(place.bucket, "/".join(parents))
-    found = bucket.find(name)
+    bucket = Bucket(place.bucket, "/".join(parents))
+    found = _objects(bucket, name)
     limits = ArchiveLimits()
     if not found:
         raise BlobNotFound(f"there is nothing at {url}")
@@ -170,20 +170,28 @@ def _found(place: _Place, url: str) -> tuple[BucketReader, str, list[FoundObject
     return bucket, name, found
 
 
+def _objects(bucket: Bucket, name: str) -> list[FoundObject]:
+    """The object itself, or else all below it as of a folder; empty if there are none."""
+    try:
+        return [bucket.head(name)]
+    except BlobNotFound:
+        return bucket.objects(name)
+
+
 def _copy(place: _Place, url: str, folder: Path, check: Callable[[], None]) -> Path:
     bucket, name, found = _found(place, url)
-    for key, _, modified in found:
+    for key, size, _, modified in found:
         try:
-            _download(bucket, key, folder / key, check)
+            _download(bucket, key, size, folder / key, check)
             os.utime(folder / key, ns=(modified, modified))
         except OSError as error:
             raise translated(error) from error
     return folder / name
 
 
-def _download(bucket: BucketReader, key: str, target: Path, check: Callable[[], None]) -> None:
+def _download(bucket: Bucket, key: str, size: int, target: Path, check: Callable[[], None]) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     with target.open("wb") as file:
-        for chunk in bucket.stream(key):
+        for chunk in bucket.stream(key, 0, size):
             file.write(chunk)
             check()

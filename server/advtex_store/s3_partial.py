@@ -1,111 +1,55 @@
 """Uploads that arrive in pieces, as multipart uploads of S3.
 
-    {key}.multipart     the id of the multipart upload; created once
-    {key}.tail-{offset} what the part that is not full yet holds of the bytes before this offset: only the last part may
-                        be below 5 MiB, and its bytes must be durable too. A request that another one has taken over
-                        from may still write one; it never replaces the one that the row tells of
+    {key}.multipart                 the id of the multipart upload; created once
+    {key}.tail-{offset}-{holder}    what this holder made durable before this offset: the ETags of all full parts, as a
+                                    line of JSON, and then the bytes of the part that is not full yet, because only the
+                                    last part may be below 5 MiB
 
 All parts but the last have the same size, so that an offset says which part comes next and how much of it its tail
-holds. boto3, because obstore cannot go on with a multipart upload that another process began.
+holds.
+
+S3 has no locks: a request that has lost the row may still replace a part, or write a tail. Its tail has its own name.
+The row tells of one tail, whose ETags say what every part must be: the object is made of exactly those parts, or not at
+all. Whoever goes on with an upload whose parts were replaced goes back to the first of them.
 """
 
 from __future__ import annotations
 
+import json
 import math
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from contextlib import suppress
 
+from advtex_store.bucket import PART, Bucket
 from advtex_store.errors import BlobNotFound, BlobsUnavailable
-from advtex_store.partials import Partial
+from advtex_store.partials import Hold, Partial
 
-if TYPE_CHECKING:
-    from advtex_store.s3 import S3Blobs
-
-PART = 8 << 20
 MAX_PARTS = 9_000  # S3 allows 10,000
 MULTIPART_SUFFIX = ".multipart"
-
-
-class S3Multipart:
-    """The calls of S3 that obstore does not have. Endpoint and credentials are those of the `AWS_*` variables."""
-
-    def __init__(self, bucket: str, prefix: str) -> None:
-        self._bucket = bucket
-        self._prefix = prefix
-
-    @cached_property
-    def _client(self) -> Any:
-        import boto3
-        from botocore.config import Config
-
-        endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or None
-        config = Config(
-            s3={"addressing_style": "path"} if endpoint else {},
-            retries={"mode": "standard", "max_attempts": 4},
-            request_checksum_calculation="when_required",  # some S3-alikes do not know the others
-        )
-        region = os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION") or "us-east-1"
-        return boto3.session.Session().client("s3", endpoint_url=endpoint, region_name=region, config=config)
-
-    def create(self, key: str) -> str:
-        """Begin a multipart upload. -> its id"""
-        with _translated(key):
-            return str(self._client.create_multipart_upload(**self._named(key))["UploadId"])
-
-    def put_part(self, key: str, upload_id: str, number: int, data: bytes) -> None:
-        """Parts are numbered from 1; sending one again replaces it."""
-        with _translated(key):
-            self._client.upload_part(**self._named(key), UploadId=upload_id, PartNumber=number, Body=data)
-
-    def complete(self, key: str, upload_id: str, size: int) -> None:
-        """Make the object of all parts."""
-        with _translated(key):
-            pages = self._client.get_paginator("list_parts").paginate(**self._named(key), UploadId=upload_id)
-            parts = [part for page in pages for part in page.get("Parts", [])]
-            if sum(part["Size"] for part in parts) != size:
-                raise BlobsUnavailable(f"{key}: parts are missing in the object storage")
-            chosen = [{"PartNumber": part["PartNumber"], "ETag": part["ETag"]} for part in parts]
-            self._client.complete_multipart_upload(
-                **self._named(key), UploadId=upload_id, MultipartUpload={"Parts": chosen}
-            )
-
-    def begun(self, prefix: str) -> list[tuple[str, str]]:
-        """Key and id of every multipart upload below the prefix that was neither completed nor aborted."""
-        with _translated(prefix):
-            pages = self._client.get_paginator("list_multipart_uploads").paginate(
-                Bucket=self._bucket, Prefix=self._prefix + prefix
-            )
-            found = [upload for page in pages for upload in page.get("Uploads", [])]
-        return [(upload["Key"].removeprefix(self._prefix), upload["UploadId"]) for upload in found]
-
-    def abort(self, key: str, upload_id: str) -> None:
-        """Drop all parts. BlobNotFound if that was done before."""
-        with _translated(key):
-            self._client.abort_multipart_upload(**self._named(key), UploadId=upload_id)
-
-    def _named(self, key: str) -> dict[str, str]:
-        return {"Bucket": self._bucket, "Key": self._prefix + key}
 
 
 class S3Partial(Partial):
     """Full parts are sent as they fill up; the rest waits in memory, and in a tail object once it is flushed."""
 
-    def __init__(self, blobs: S3Blobs, multipart: S3Multipart, key: str, size: int, offset: int) -> None:
+    def __init__(self, bucket: Bucket, key: str, size: int, offset: int, hold: Hold) -> None:
         super().__init__(offset)
-        self._blobs = blobs
-        self._multipart = multipart
+        self._bucket = bucket
         self._key = key
         self._size = size
+        self._hold = hold
         self._part = max(PART, math.ceil(size / MAX_PARTS))
-        self._number, rest = divmod(offset, self._part)
-        self._buffer = bytearray(blobs.get(self._tail(offset)) if rest else b"")
-        if len(self._buffer) != rest:
-            raise BlobNotFound(f"{key}: the first {offset} bytes are not held any more")
-        self._flushed = self._settled = offset
-        self._upload_id = self._begun(offset)
+        self._etags: list[str] = []
+        self._buffer = bytearray()
+        self._told: str | None = None  # name of the tail that the row tells of ...
+        self._tail: str | None = None  # ... and of the newest one
+        self._flushed = offset
+        self._upload_id = self._begun()
+        parts = bucket.parts(key, self._upload_id)
+        if offset > 0:
+            self._read_tail(parts)
+        replaced = [number for number, etag in enumerate(self._etags) if parts.get(number + 1) != etag]
+        if replaced:
+            self.offset = replaced[0] * self._part
+            del self._etags[replaced[0] :], self._buffer[:]
 
     def write(self, data: bytes) -> None:
         view = memoryview(data)
@@ -118,56 +62,79 @@ class S3Partial(Partial):
                 self._send()
 
     def flush(self) -> None:
-        if self._buffer and self.offset > self._flushed:
-            self._blobs.put(self._tail(self.offset), bytes(self._buffer))
+        if self.offset == self._flushed:
+            return
+        if self.offset == self._size and self._buffer:
+            self._send()
+        self._hold.check()
+        self._tail = f"{self._key}.tail-{self.offset}-{self._hold.holder}"
+        self._bucket.put(self._tail, json.dumps(self._etags).encode() + b"\n" + self._buffer)
         self._flushed = self.offset
 
     def settle(self) -> None:
-        before, self._settled = self._settled, self._flushed
-        if before < self._settled and before % self._part:
-            self._blobs.delete(self._tail(before))
+        before, self._told = self._told, self._tail
+        if before is not None and before != self._tail:
+            self._bucket.delete(before)
 
     def publish(self) -> None:
         try:
-            if self._buffer:
-                self._send()
-            self._multipart.complete(self._key, self._upload_id, self._size)
-        except (BlobNotFound, BlobsUnavailable):  # another request for the same bytes may have been faster
-            if not self._blobs.is_published(self._key, self._size):
+            self._bucket.complete(self._key, self._upload_id, self._etags)
+        except (BlobNotFound, BlobsUnavailable):  # another request may have been faster
+            if not self._is_published():
                 raise
-        self._blobs.drop_partial(self._key)
+        drop(self._bucket, self._key)
 
     def close(self) -> None:
         self._buffer.clear()
 
     def _send(self) -> None:
-        self._multipart.put_part(self._key, self._upload_id, self._number + 1, bytes(self._buffer))
-        self._number += 1
+        self._hold.check()
+        number = len(self._etags) + 1
+        self._etags.append(self._bucket.put_part(self._key, self._upload_id, number, bytes(self._buffer)))
         self._buffer.clear()
 
-    def _begun(self, offset: int) -> str:
+    def _begun(self) -> str:
         """The id of the multipart upload, of a new one at the very beginning."""
         name = self._key + MULTIPART_SUFFIX
-        if offset == 0 and not self._blobs.exists(name):
-            upload_id = self._multipart.create(self._key)
-            if self._blobs.put_if_absent(name, upload_id.encode()):
-                return upload_id
-            self._multipart.abort(self._key, upload_id)
-        return self._blobs.get(name).decode()
+        with suppress(BlobNotFound):
+            return self._bucket.get(name).decode()
+        if self.offset > 0:
+            raise BlobNotFound(name)
+        upload_id = self._bucket.begin(self._key)
+        if self._bucket.put_if_absent(name, upload_id.encode()):
+            return upload_id
+        self._bucket.abort(self._key, upload_id)
+        return self._bucket.get(name).decode()
 
-    def _tail(self, offset: int) -> str:
-        return f"{self._key}.tail-{offset}"
+    def _read_tail(self, parts: dict[int, str]) -> None:
+        self._told = self._tail = f"{self._key}.tail-{self.offset}-{self._hold.kept_by}"
+        try:
+            line, _, rest = self._bucket.get(self._told).partition(b"\n")
+            self._etags = json.loads(line)
+        except BlobNotFound:
+            rest = self._read_nameless_tail(parts)
+        self._buffer += rest
+        if min(len(self._etags) * self._part + len(rest), self._size) != self.offset:
+            raise BlobNotFound(f"{self._key}: the first {self.offset} bytes are not held any more")
+
+    def _read_nameless_tail(self, parts: dict[int, str]) -> bytes:
+        """A server of an earlier version made it: it has the bytes alone, and is left out where there are none."""
+        self._told = self._tail = f"{self._key}.tail-{self.offset}"
+        full, rest = divmod(self.offset, self._part)
+        self._etags = [parts[number] for number in sorted(parts) if number <= full]
+        return self._bucket.get(self._told) if rest else b""
+
+    def _is_published(self) -> bool:
+        with suppress(BlobNotFound):
+            return self._bucket.head(self._key).size == self._size
+        return False
 
 
-@contextmanager
-def _translated(key: str) -> Iterator[None]:
-    from botocore.exceptions import BotoCoreError, ClientError
-
-    try:
-        yield
-    except ClientError as error:
-        if error.response.get("Error", {}).get("Code") in ("NoSuchUpload", "NoSuchKey", "404"):
-            raise BlobNotFound(key) from None
-        raise BlobsUnavailable(f"the object storage does not answer: {error}") from error
-    except BotoCoreError as error:
-        raise BlobsUnavailable(f"the object storage does not answer: {error}") from error
+def drop(bucket: Bucket, key: str) -> None:
+    """Remove the pieces of an upload; no error if there are none."""
+    marker = key + MULTIPART_SUFFIX
+    with suppress(BlobNotFound):
+        bucket.abort(key, bucket.get(marker).decode())
+    for found in bucket.objects(key.rpartition("/")[0]):
+        if found.name.startswith(f"{key}."):
+            bucket.delete(found.name)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 from collections.abc import Callable
 
-from sqlalchemy import ColumnElement, and_, exists, func, select, update
+from sqlalchemy import ColumnElement, and_, delete, exists, func, select, update
 
 from advtex_store.accounts import lock_owner
 from advtex_store.database import Database
@@ -89,7 +89,7 @@ class Uploads:
             return list(session.scalars(query.limit(FOUND)))
 
     def seize(self, upload_id: str, owner: str) -> UploadRow:
-        """Take an unfinished upload over from whichever request has it. RecordNotFound."""
+        """Take an unfinished upload over from whichever request has it. RecordNotFound; Superseded: it is complete."""
         with self.database.write() as session:
             row: UploadRow | None = session.scalar(
                 update(UploadRow)
@@ -99,8 +99,18 @@ class Uploads:
                 execution_options={"populate_existing": True, "synchronize_session": False},
             )
             if row is None:
+                is_whole = (UploadRow.owner == owner, UploadRow.sha256.is_not(None), UploadRow.deleted_at.is_(None))
+                if session.scalar(select(UploadRow.id).where(UploadRow.id == upload_id, *is_whole)):
+                    raise Superseded(f"upload {upload_id} is complete")
                 raise RecordNotFound(f"there is no unfinished upload {upload_id}")
             return row
+
+    def check_held(self, upload_id: str, holder: str) -> None:
+        """Superseded: another request has the upload now, or it is complete, or it was deleted."""
+        with self.database.read() as session:
+            held = (UploadRow.id == upload_id, UploadRow.holder == holder, _unfinished())
+            if session.scalar(select(UploadRow.id).where(*held)) is None:
+                raise _superseded(upload_id)
 
     def advance(self, upload_id: str, holder: str, offset: int) -> float:
         """The first `offset` bytes are durable. -> when the upload expires. Superseded: another request has it now."""
@@ -109,15 +119,19 @@ class Uploads:
             advanced = session.scalar(
                 update(UploadRow)
                 .where(UploadRow.id == upload_id, UploadRow.holder == holder, _unfinished())
-                .values(offset=offset, expires_at=expires_at)
+                .values(offset=offset, kept_by=holder, expires_at=expires_at)
                 .returning(UploadRow.id)
             )
             if advanced is None:
-                raise Superseded(f"a newer request goes on with upload {upload_id}, or it was deleted")
+                raise _superseded(upload_id)
             return expires_at
 
-    def finish(self, upload_id: str, sha256: str) -> UploadRow:
-        """The blob is durable. Finishing again with the same sha256 changes nothing."""
+    def finish(self, upload_id: str, sha256: str, kept_by: str | None = None) -> UploadRow:
+        """The blob is durable. Finishing again with the same sha256 changes nothing.
+
+        kept_by: the request that told of all its bytes, None if they came by none. Whoever then gives the blob its name
+        may finish it; Superseded: the row tells of another request's bytes.
+        """
         with self.database.write() as session:
             row = session.scalar(select(UploadRow).where(UploadRow.id == upload_id).with_for_update())
             if row is None or row.deleted_at is not None:
@@ -126,6 +140,8 @@ class Uploads:
                 return row
             if row.sha256 is not None:
                 raise IllegalTransition(f"upload {upload_id} is complete with other bytes")
+            if row.kept_by != kept_by:
+                raise _superseded(upload_id)
             row.sha256, row.announced_sha256, row.offset, row.holder = sha256, sha256, row.size, None
             row.expires_at = self.database.now(session) + self.retention_seconds
             return row
@@ -136,12 +152,14 @@ class Uploads:
             query = select(func.sum(UploadRow.size - UploadRow.offset)).where(_unfinished())
             return int(session.scalar(query) or 0)
 
-    def discard(self, upload_id: str) -> None:
-        """Forget an upload that was cut off; nothing of it is kept."""
+    def discard(self, upload_id: str, holder: str | None) -> bool:
+        """Forget an upload that cannot be completed, None for one that no request has seized yet.
+
+        -> whether that was done: not if another request has it now, or if it is complete
+        """
         with self.database.write() as session:
-            row = session.get(UploadRow, upload_id)
-            if row is not None:
-                session.delete(row)
+            mine = (UploadRow.id == upload_id, UploadRow.holder == holder, UploadRow.sha256.is_(None))
+            return session.scalar(delete(UploadRow).where(*mine).returning(UploadRow.id)) is not None
 
     def delete(self, upload_id: str, owner: str | None = None) -> None:
         """Hide an upload that no job needs any more; its blob follows."""
@@ -155,6 +173,10 @@ class Uploads:
             if session.scalar(select(exists().where(JobRow.upload_id == upload_id, JobRow.deleted_at.is_(None)))):
                 raise IllegalTransition(f"upload {upload_id} belongs to a job: delete the job first")
             row.deleted_at = self.database.now(session)
+
+
+def _superseded(upload_id: str) -> Superseded:
+    return Superseded(f"a newer request goes on with upload {upload_id}, or it was deleted")
 
 
 def _unfinished() -> ColumnElement[bool]:

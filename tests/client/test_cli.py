@@ -304,7 +304,7 @@ def test_the_client_stays_light() -> None:
         "redis",
         "rq",
         "sqlalchemy",
-        "obstore",
+        "boto3",
         "advtex_store",
         "advtex_engine",
     ]

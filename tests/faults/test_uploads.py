@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -18,6 +19,7 @@ import httpx
 import psutil
 import pytest
 from cutting_proxy import BUFFER, CuttingProxy
+from fleet import Place, fleet
 from live_service import LiveService, wait_until
 
 from advtex_client import Client
@@ -105,11 +107,13 @@ def begun(service: LiveService, size: int) -> str:
     return str(httpx.post(f"{service.url}/v1/uploads", headers=headers).headers["Location"])
 
 
-def raw_patch(service: LiveService, location: str, length: int, key: str) -> socket.socket:
-    parts = urlsplit(service.url)
+def raw_patch(url: str, location: str, length: int, key: str, offset: int = 0) -> socket.socket:
+    parts = urlsplit(url)
     connection = socket.create_connection((parts.hostname, parts.port), timeout=20)
     head = f"PATCH {location} HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {key}\r\nTus-Resumable: 1.0.0\r\n"
-    head += f"Content-Type: application/offset+octet-stream\r\nUpload-Offset: 0\r\nContent-Length: {length}\r\n\r\n"
+    head += (
+        f"Content-Type: application/offset+octet-stream\r\nUpload-Offset: {offset}\r\nContent-Length: {length}\r\n\r\n"
+    )
     connection.sendall(head.encode())
     return connection
 
@@ -124,7 +128,7 @@ def bytes_on_the_way(connection: socket.socket) -> int:
 
 def test_a_half_open_line_does_not_keep_the_next_one_waiting(service: LiveService) -> None:
     location = begun(service, 100 * MB)
-    connection = raw_patch(service, location, 100 * MB, service.key)
+    connection = raw_patch(service.url, location, 100 * MB, service.key)
     connection.sendall(b"x" * (30 * MB))  # and then nothing more, not even its end
     headers = {"Authorization": f"Bearer {service.key}", **TUS}
     with httpx.Client(base_url=service.url, headers=headers) as http:
@@ -142,12 +146,45 @@ def test_a_half_open_line_does_not_keep_the_next_one_waiting(service: LiveServic
     connection.close()
 
 
+def test_two_clients_of_two_servers_send_differing_bytes(tmp_path: Path, place: dict[str, str]) -> None:
+    """The first one is slow, and does not know that it has lost the upload when the rest of its bytes come."""
+    s3 = {name: value for name, value in os.environ.items() if name.startswith("AWS_")} if place else None
+    where = Place(tmp_path / "data", **place, s3=s3)
+    with fleet(tmp_path, where, servers=2, workers=0, engine="journaled") as running:
+        key = running.store.accounts.create_key("tests", owner="tests")
+        headers = {"Authorization": f"Bearer {key}", **TUS}
+        begun = httpx.post(f"{running.urls[0]}/v1/uploads", headers={**headers, "Upload-Length": str(60 * MB)})
+        location = str(begun.headers["Location"])
+        upload_id = location.rpartition("/")[2]
+        older = raw_patch(running.urls[0], location, 60 * MB, key)
+        older.sendall(b"A" * (30 * MB))
+        wait_until(lambda: running.store.uploads.upload(upload_id).offset > 20 * MB)
+        wait_until(lambda: bytes_on_the_way(older) == 0)
+        offset = int(httpx.head(running.urls[1] + location, headers=headers).headers["Upload-Offset"])
+        assert 20 * MB < offset <= 30 * MB
+        newer = raw_patch(running.urls[1], location, 60 * MB - offset, key, offset)
+        newer.sendall(b"B" * (25 * MB))
+        wait_until(lambda: running.store.uploads.upload(upload_id).offset > offset + 16 * MB)
+        with suppress(OSError):  # it may be answered, and its line closed, before all has come
+            older.sendall(b"A" * (30 * MB))
+        answered = older.recv(100)
+        newer.sendall(b"B" * (35 * MB - offset))
+        assert newer.recv(100).startswith(b"HTTP/1.1 204")
+        assert answered.startswith(b"HTTP/1.1 409")
+        view = httpx.get(running.urls[0] + location, headers=headers).json()
+        stored = b"".join(running.store.blobs.stream(keys.scan_key(upload_id)))
+        assert stored == b"A" * offset + b"B" * (60 * MB - offset)
+        assert view["sha256"] == hashlib.sha256(stored).hexdigest()
+        older.close()
+        newer.close()
+
+
 def test_not_a_byte_of_a_stranger_is_written(service: LiveService) -> None:
     location = begun(service, 100 * MB)
     server = psutil.Process(service.server.pid)
     before = server.io_counters().write_bytes
     for key in ("adv_000000000000_" + "a" * 40, "", service.key[:-1] + ("a" if service.key[-1] != "a" else "b")):
-        connection = raw_patch(service, location, 100 * MB, key)
+        connection = raw_patch(service.url, location, 100 * MB, key)
         try:
             for _ in range(50):
                 connection.sendall(b"x" * MB)

@@ -33,7 +33,7 @@ QUICK: dict[str, Any] = {
 
 @functools.cache
 def description() -> dict[str, Any]:
-    """Of the API; the same for all servers, and slow to make."""
+    """The description of the API: the same for all servers, and slow to make."""
     return create_app(ServerSettings()).openapi()
 
 

@@ -103,9 +103,9 @@ def test_a_scan_in_s3_is_read_where_it_lies(
 def test_of_a_large_scan_in_s3_little_is_fetched_and_nothing_spooled(
     make_live: Callable[..., Any], s3_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from advtex_store.s3 import BucketReader
+    from advtex_store.bucket import Bucket
 
-    folder, fetched, read = write_scan(tmp_path / "large"), list[int](), BucketReader.read
+    folder, fetched, read = write_scan(tmp_path / "large"), list[int](), Bucket.get
     for number in range(20):
         (folder / f"extra-{number}.bin").write_bytes(os.urandom(2 << 20))
     packed = write_zip(tmp_path / "large.zip", folder)
@@ -115,7 +115,7 @@ def test_of_a_large_scan_in_s3_little_is_fetched_and_nothing_spooled(
         fetched.append(end - start)
         return read(self, name, start, end)
 
-    monkeypatch.setattr(BucketReader, "read", counted)
+    monkeypatch.setattr(Bucket, "get", counted)
     live = make_live(reference_roots=s3_url)
     assert live.job(source=f"{s3_url}/large.zip")["state"] == "queued"
     assert 0 < sum(fetched) < 0.2 * packed.stat().st_size

@@ -354,7 +354,7 @@ def test_a_server_that_stops_in_mid_patch_keeps_what_came(make_live: Callable[..
     assert again.http.get(url).json()["sha256"] == SHA256, "digested anew: the other process knew the first part"
 
 
-def test_a_crash_between_the_blob_and_its_row_is_mended_by_the_next_patch(
+def test_a_crash_between_the_blob_and_its_row_is_mended_when_the_client_asks(
     live: Any, is_error: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from sqlalchemy.exc import OperationalError
@@ -367,14 +367,14 @@ def test_a_crash_between_the_blob_and_its_row_is_mended_by_the_next_patch(
     with monkeypatch.context() as patched:
         patched.setattr(live.store.uploads, "finish", broken)
         is_error(patch(live, url, len(DATA) - 10, DATA[-10:]), 503, "unavailable")
-    offset = offset_of(live, url)
-    assert offset < len(DATA), "a client that sees all of its bytes would stop here"
-    assert patch(live, url, offset, DATA[offset:]).status_code == 204
-    assert live.http.get(url).json()["sha256"] == SHA256
+    assert not live.http.get(url).json()["complete"]
+    is_error(patch(live, url, len(DATA) - 10, DATA[-10:]), 409, "conflict")
+    assert offset_of(live, url) == len(DATA)
+    assert live.http.get(url).json()["sha256"] == SHA256, "a client that sees all of its bytes stops here"
     assert stored(live, url) == DATA
 
 
-def test_a_storage_that_fails_at_the_very_end_costs_one_piece(
+def test_a_storage_that_fails_at_the_very_end_costs_nothing(
     live: Any, is_error: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_: object) -> None:
@@ -387,8 +387,7 @@ def test_a_storage_that_fails_at_the_very_end_costs_one_piece(
         for kind in (FolderPartial, S3Partial):
             patched.setattr(kind, "publish", broken)
         is_error(patch(live, url, 8 << 20, whole[8 << 20 :]), 503, "unavailable")
-    offset = offset_of(live, url)
-    assert len(whole) - (8 << 20) <= offset < len(whole)
-    assert patch(live, url, offset, whole[offset:]).status_code == 204
+        assert live.http.head(url, headers=TUS).status_code == 503, "a client that sees all of its bytes would stop"
+    assert patch(live, url, len(whole), b"").status_code == 204
     assert stored(live, url) == whole
     assert [info.key for info in live.store.blobs.list("scans/")] == [keys.scan_key(url.rpartition("/")[2])]

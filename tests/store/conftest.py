@@ -105,7 +105,7 @@ def sqlite_bench(sqlite_url: str) -> Iterator[Bench]:
 
 @pytest.fixture
 def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of multipart uploads, for scans of a few bytes."""
+    """Parts of multipart uploads are as small as scans of a few bytes need."""
     import moto.s3.models
 
     monkeypatch.setattr("advtex_store.s3_partial.PART", 8)

@@ -16,7 +16,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from advtex_store.blobs import CHUNK, Blobs, FolderBlobs, check_key, open_blobs
-from advtex_store.errors import BlobNotFound, BlobsUnavailable, NoSpace
+from advtex_store.bucket import Bucket
+from advtex_store.errors import BlobNotFound, BlobsRefused, BlobsUnavailable, NoSpace
 
 BIG = os.urandom(1 << 20) * 20  # more than one part of a multipart upload
 
@@ -167,6 +168,47 @@ def test_an_unreachable_storage_says_so(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:1")
     with pytest.raises(BlobsUnavailable, match="does not answer"):
         open_blobs("s3://bucket/x", tmp_path / "spool").check()
+
+
+def test_an_answer_that_breaks_off_is_asked_for_again(s3_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from botocore.exceptions import ReadTimeoutError
+    from botocore.response import StreamingBody
+
+    bucket = Bucket(*s3_url.removeprefix("s3://").split("/", 1))
+    bucket.put("a", b"0123456789")
+    read, breaks = StreamingBody.read, 2
+
+    def broken(self: StreamingBody) -> bytes:
+        nonlocal breaks
+        breaks -= 1
+        if breaks >= 0:
+            raise ReadTimeoutError(endpoint_url="")
+        return bytes(read(self))
+
+    monkeypatch.setattr(StreamingBody, "read", broken)
+    assert bucket.get("a", 2, 5) == b"234"
+    breaks = 100
+    with pytest.raises(BlobsUnavailable, match="broke off"):
+        bucket.get("a")
+
+
+def test_what_an_object_storage_refuses_is_told_apart(s3_url: str) -> None:
+    bucket = Bucket(*s3_url.removeprefix("s3://").split("/", 1))
+    bucket.put("a/folder/", b"")
+    bucket.put("a/b", b"x")
+    assert [found.name for found in bucket.objects("a")] == ["a/b"], "tools make empty objects for folders"
+    missing = Bucket("no-such-bucket", "x")
+    for refused in (lambda: missing.put("a", b""), lambda: missing.get("a"), lambda: missing.objects("a")):
+        with pytest.raises(BlobsRefused, match="no bucket"):
+            refused()
+    for gone in (lambda: bucket.get("c"), lambda: bucket.head("c"), lambda: bucket.parts("a/b", "no-such-id")):
+        with pytest.raises(BlobNotFound):
+            gone()
+    upload_id = bucket.begin("d")
+    etag = bucket.put_part("d", upload_id, 1, b"one")
+    bucket.put_part("d", upload_id, 1, b"two")
+    with pytest.raises(BlobsUnavailable, match="InvalidPart"):
+        bucket.complete("d", upload_id, [etag])
 
 
 def test_leftovers_are_cleared_by_age(blobs: Blobs) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import tempfile
 from collections.abc import Callable, Iterator
@@ -20,7 +21,7 @@ from advtex_store.blobs import Blobs, FolderBlobs, open_blobs
 from advtex_store.errors import RecordNotFound, StoreError
 from advtex_store.ids import new_id
 from advtex_store.models import JobRow, UploadRow
-from advtex_store.partials import Partial, Unpublished
+from advtex_store.partials import Hold, Partial, Unpublished
 from advtex_store.results import Results
 from advtex_store.retention import ORPHAN_SECONDS, SETTLED_SECONDS, Retention
 from advtex_store.s3 import S3Blobs
@@ -87,13 +88,17 @@ class World:
         row = self.bench.uploads.create("me", SIZE)
         self.uploads.append(row.id)
         row = self.bench.uploads.seize(row.id, "me")
-        self.partials.append((row.holder, self.blobs.resume(keys.scan_key(row.id), SIZE, 0)))
+        self.partials.append((row.holder, self.resumed(row)))
         self.go_on_with(*self.partials[-1])
 
     def open_request(self) -> None:
         """tus: seize the row, then go on with its bytes."""
         row = self.bench.uploads.seize(self.pick(self.uploads), "me")
-        self.partials.append((row.holder, self.blobs.resume(keys.scan_key(row.id), SIZE, row.offset)))
+        self.partials.append((row.holder, self.resumed(row)))
+
+    def resumed(self, row: UploadRow) -> Partial:
+        check = functools.partial(self.bench.uploads.check_held, row.id, row.holder)
+        return self.blobs.resume(keys.scan_key(row.id), SIZE, row.offset, Hold(str(row.holder), row.kept_by, check))
 
     def send_piece(self) -> None:
         self.go_on_with(*self.pick(self.partials))
@@ -101,17 +106,20 @@ class World:
     def go_on_with(self, holder: str, partial: Partial) -> None:
         row = self.held_by(holder)
         assert partial.offset >= row.offset, "bytes are durable that no writer wrote"
-        partial.write(SCAN[partial.offset : min(partial.offset + 4, SIZE - 1)])
+        self.send(row, partial, SCAN[partial.offset : min(partial.offset + 4, SIZE - 1)])
+
+    def send(self, row: UploadRow, partial: Partial, data: bytes) -> None:
+        partial.write(data)
         partial.flush()
-        self.bench.uploads.advance(row.id, holder, partial.offset)
+        self.bench.uploads.advance(row.id, row.holder, partial.offset)
         partial.settle()
 
     def send_last_piece(self) -> None:
         holder, partial = self.pick(self.partials)
         row = self.held_by(holder)
-        partial.write(SCAN[partial.offset :])
+        self.send(row, partial, SCAN[partial.offset :])
         partial.publish()
-        self.bench.uploads.finish(row.id, "ab" * 32)
+        self.bench.uploads.finish(row.id, "ab" * 32, holder)
 
     def held_by(self, holder: str) -> UploadRow:
         with self.bench.database.read() as session:
@@ -121,13 +129,13 @@ class World:
         return row
 
     def die_in_mid_request(self) -> None:
-        """Of S3: between the multipart upload and the blob that has its id; and in the middle of a result."""
+        """S3 only: between the multipart upload and the blob that has its id; and in the middle of a result."""
         if isinstance(self.blobs, S3Blobs):
             upload, job = self.pick(self.uploads), self.pick(self.jobs)
             self.bench.uploads.upload(upload)
-            self.blobs._multipart.create(keys.scan_key(upload))
+            self.blobs.bucket.begin(keys.scan_key(upload))
             self.bench.records.job(job)
-            self.blobs._multipart.create(keys.result_key(job, 1, "texture.png"))
+            self.blobs.bucket.begin(keys.result_key(job, 1, "texture.png"))
 
     def finish_upload(self) -> None:
         upload = self.pick(self.uploads)
@@ -138,8 +146,7 @@ class World:
     def discard_upload(self) -> None:
         """A server that dies between row and blob leaves an orphan."""
         upload = self.pick(self.uploads)
-        if self.bench.uploads.upload(upload).sha256 is None:
-            self.bench.uploads.discard(upload)
+        self.bench.uploads.discard(upload, self.bench.uploads.upload(upload).holder)
 
     def write_late(self) -> None:
         """A writer that does not know yet that its row is gone."""
@@ -195,7 +202,7 @@ class World:
                 assert self.blobs.is_published(keys.scan_key(upload.id), SIZE), "a scan was removed"
             begun = session.query(UploadRow).filter(UploadRow.deleted_at.is_(None), UploadRow.sha256.is_(None))
             for upload in begun.filter(UploadRow.offset > 0):
-                self.check_pieces(keys.scan_key(upload.id), upload.offset)
+                self.check_pieces(upload)
             for job in session.query(JobRow).filter(JobRow.deleted_at.is_(None)):
                 for entry in job.results:
                     assert self.blobs.exists(entry["key"]), "a result was removed"
@@ -204,9 +211,10 @@ class World:
                 elif job.state == "running":
                     assert self.blobs.exists(keys.checkpoint_prefix(job.id, job.attempt) + "1/0")
 
-    def check_pieces(self, key: str, offset: int) -> None:
+    def check_pieces(self, row: UploadRow) -> None:
         """What the row calls durable can be gone on with."""
-        self.blobs.resume(key, SIZE, offset).close()  # else BlobNotFound
+        key = keys.scan_key(row.id)
+        self.resumed(row).close()  # else BlobNotFound
         if isinstance(self.blobs, S3Blobs) and not self.blobs.is_published(key, SIZE):
             held = [found.upload_id for found in self.blobs.unpublished(keys.SCANS) if found.key == key]
             assert self.blobs.get(key + MULTIPART_SUFFIX).decode() in held, "parts were removed"
@@ -302,18 +310,19 @@ def test_multipart_uploads_whose_writers_died_are_aborted(bench: Any, s3_url: st
     assert isinstance(blobs, S3Blobs)
     retention = Retention(bench.database, blobs)
     begun, complete, job = bench.uploads.create("me", SIZE).id, bench.finished_upload(), bench.job()
-    create = blobs._multipart.create
+    create = blobs.bucket.begin
     kept = [create(keys.scan_key(begun)), create(keys.result_key(job, 1, "a")), create("scans/by hand/x")]
     for key in (keys.scan_key(new_id(bench.clock.now - ORPHAN_SECONDS)), keys.scan_key(complete)):
         create(key)
 
     def left() -> list[str]:
-        begun = blobs._multipart.begun(keys.SCANS) + blobs._multipart.begun(keys.JOBS)
+        begun = [*blobs.bucket.begun("scans"), *blobs.bucket.begun("jobs")]
         return sorted(upload_id for _, upload_id in begun)
 
     assert retention.sweep() == 2
     assert left() == sorted(kept), "a writer may have begun them this moment"
-    blobs.resume(keys.scan_key(begun), SIZE, 0).close()  # the client tries again
+    row = bench.uploads.seize(begun, "me")
+    blobs.resume(keys.scan_key(begun), SIZE, 0, Hold(row.holder, None, lambda: None)).close()  # the client tries again
     assert retention.sweep() == 1
     assert kept[0] not in left()
     assert len(left()) == 3

@@ -23,7 +23,8 @@ def test_an_upload_from_beginning_to_end(bench: Any) -> None:
     assert (half.offset, half.sha256, half.expires_at) == (4, None, bench.clock.now + 86400)
     assert bench.uploads.expected_bytes() == 6
     bench.clock.now += 5
-    whole = bench.uploads.finish(row.id, "ab" * 32)
+    bench.uploads.advance(row.id, holder, 10)
+    whole = bench.uploads.finish(row.id, "ab" * 32, holder)
     assert (whole.offset, whole.sha256, whole.expires_at) == (10, "ab" * 32, bench.clock.now + 1000)
     assert bench.uploads.finish(row.id, "ab" * 32).id == row.id
     with pytest.raises(IllegalTransition):
@@ -40,11 +41,18 @@ def test_only_the_newest_holder_moves_the_offset(bench: Any) -> None:
     bench.uploads.advance(row.id, new, 5)
     with pytest.raises(RecordNotFound):
         bench.uploads.seize(row.id, "somebody else")
-    bench.uploads.finish(row.id, "ab" * 32)
+    with pytest.raises(Superseded):
+        bench.uploads.check_held(row.id, old)
+    bench.uploads.check_held(row.id, new)
+    with pytest.raises(Superseded):
+        bench.uploads.finish(row.id, "cd" * 32, old)
+    bench.uploads.finish(row.id, "ab" * 32, new)
     with pytest.raises(Superseded):
         bench.uploads.advance(row.id, new, 6)
-    with pytest.raises(RecordNotFound):
+    with pytest.raises(Superseded, match="complete"):
         bench.uploads.seize(row.id, "me")
+    with pytest.raises(RecordNotFound):
+        bench.uploads.seize(row.id, "somebody else")
 
 
 def test_the_quota_counts_what_is_kept_and_what_is_on_its_way(bench: Any) -> None:
@@ -106,10 +114,21 @@ def test_uploads_are_found_by_their_bytes(bench: Any) -> None:
 
 def test_a_discarded_upload_is_gone(bench: Any) -> None:
     row = bench.uploads.create("me", 10)
-    bench.uploads.discard(row.id)
-    bench.uploads.discard(row.id)
+    assert bench.uploads.discard(row.id, None)
+    assert not bench.uploads.discard(row.id, None)
     with pytest.raises(RecordNotFound):
         bench.uploads.finish(row.id, "ab" * 32)
+
+
+def test_only_the_holder_discards_and_only_what_is_not_complete(bench: Any) -> None:
+    row = bench.uploads.create("me", 10)
+    old, new = (bench.uploads.seize(row.id, "me").holder for _ in range(2))
+    assert not bench.uploads.discard(row.id, old)
+    assert not bench.uploads.discard(row.id, None)
+    bench.uploads.advance(row.id, new, 10)
+    bench.uploads.finish(row.id, "ab" * 32, new)
+    assert not bench.uploads.discard(row.id, new)
+    assert bench.uploads.upload(row.id).sha256 == "ab" * 32
 
 
 def test_an_upload_with_a_job_stays(bench: Any) -> None:

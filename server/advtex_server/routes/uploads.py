@@ -194,14 +194,15 @@ def get_storage(service: TheService) -> StorageInfo:
 async def _receive(
     request: Request, intake: Intake, row: UploadRow, offset: int = 0, checksum: Checksum | None = None
 ) -> UploadView:
-    """The body of a request that goes on with an upload at `offset`."""
+    """The body of a request that goes on with an upload at `offset`. `row` gets the holder: this request."""
     length = request.headers.get("content-length", "0")
     async with _bodies(request).alone(row.id, PATIENCE) as body:
-        row = await run_in_threadpool(intake.store.uploads.upload, row.id, row.owner)
-        if row.sha256 is not None:
-            _check_place(row, offset, length)
-            return upload_view(row)
+        now = await run_in_threadpool(intake.store.uploads.upload, row.id, row.owner)
+        if now.sha256 is not None:
+            _check_place(now, offset, length)
+            return upload_view(now)
         receiving = await run_in_threadpool(intake.resume, row.owner, row.id, checksum)
+        row.holder = receiving.row.holder
         try:
             _check_place(receiving.row, offset, length)
             await receive(body, request.stream(), receiving, intake.settings.idle_seconds)
@@ -224,10 +225,10 @@ async def _receive_whole(request: Request, intake: Intake, row: UploadRow) -> Up
         if not view.complete:
             raise ApiError(ErrorCode.bad_request, f"{view.offset} bytes came, {row.size} were announced")
     except Exception:
-        await run_in_threadpool(intake.forget, row.id)
+        await run_in_threadpool(intake.forget, row.id, row.holder)
         raise
     except BaseException:
-        intake.forget(row.id)  # inline: a canceled task could not wait for a thread
+        intake.forget(row.id, row.holder)  # inline: a canceled task could not wait for a thread
         raise
     return view
 

@@ -255,16 +255,17 @@ class Simulation:
             thread.start()
         busy = [worker for worker in self.workers if worker.held]
         random.Random(0).shuffle(busy)
-        with ThreadPoolExecutor(THREADS) as threads:
-            waits = []
-            for worker in busy[: int(seconds * ENDING_PER_SECOND)]:
-                waits.append(threads.submit(self.next_job, worker))
-                time.sleep(1 / ENDING_PER_SECOND)
-            found = [wait.result() for wait in waits]
-        self._done.set()
-        for thread in (rounds, signs):
-            thread.join()
-        return found
+        try:
+            with ThreadPoolExecutor(THREADS) as threads:
+                waits = []
+                for worker in busy[: int(seconds * ENDING_PER_SECOND)]:
+                    waits.append(threads.submit(self.next_job, worker))
+                    time.sleep(1 / ENDING_PER_SECOND)
+                return [wait.result() for wait in waits]
+        finally:
+            self._done.set()
+            for thread in (rounds, signs):
+                thread.join()
 
     async def _dispatch(self, dispatcher: Dispatcher) -> None:
         task = asyncio.create_task(dispatcher.run())

@@ -18,8 +18,9 @@ import pytest
 import redis
 
 from advtex_server.embedded import free_port
-from advtex_store.blobs import Blobs, open_blobs
+from advtex_store.blobs import Blobs
 from advtex_store.database import upgrade_database
+from advtex_store.places import open_blobs
 
 # A shell's background command is started with Ctrl-C ignored, and its children inherit that; some tests send it.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -20,7 +20,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
-from urllib.parse import unquote, urlsplit
 
 from advtex_store.errors import BlobNotFound, BlobsUnavailable
 from advtex_store.files import fsync_dir, translated
@@ -370,18 +369,6 @@ class FolderBlobs(Blobs):
             with suppress(FileExistsError):  # `exist_ok` would raise when the other's folder is gone at a second look
                 folder.mkdir()
             fsync_dir(folder.parent)
-
-
-def open_blobs(url: str, spool_dir: Path) -> Blobs:
-    """The storage behind `file:///folder` or `s3://bucket/prefix`."""
-    parts = urlsplit(url)
-    if parts.scheme == "file":
-        return FolderBlobs(Path(unquote(parts.path)))
-    if parts.scheme == "s3":
-        from advtex_store.s3 import S3Blobs
-
-        return S3Blobs(parts.netloc, parts.path.strip("/"), spool_dir)
-    raise ValueError(f"ADVTEX_BLOB_URL is {url!r}: it must start with file:// or s3://")
 
 
 def check_key(key: str) -> str:

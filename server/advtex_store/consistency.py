@@ -20,6 +20,7 @@ from advtex_store import keys
 from advtex_store.errors import BlobNotFound, IllegalTransition, RecordNotFound, StaleAttempt
 from advtex_store.ids import ID, created_at
 from advtex_store.models import EventRow, JobRow, TallyRow, UploadRow
+from advtex_store.partials import Hold
 from advtex_store.retention import ORPHAN_SECONDS
 from advtex_store.store import Store
 from advtex_store.tallies import JOBS, tally_end
@@ -113,7 +114,8 @@ def _partials(store: Store, uploads: Sequence[UploadRow]) -> Iterator[Disagreeme
 
 def _holds(store: Store, row: UploadRow) -> bool:
     try:
-        store.blobs.resume(keys.scan_key(row.id), row.size, row.offset).close()
+        hold = Hold(str(row.holder), row.kept_by, lambda: None)
+        store.blobs.resume(keys.scan_key(row.id), row.size, row.offset, hold).close()
     except BlobNotFound:
         return False
     return True
@@ -122,7 +124,7 @@ def _holds(store: Store, row: UploadRow) -> bool:
 def _begin_anew(store: Store, row: UploadRow) -> str:
     with store.database.write() as session:
         same = (UploadRow.id == row.id, UploadRow.offset == row.offset, UploadRow.sha256.is_(None))
-        begun = update(UploadRow).where(*same).values(offset=0, holder=None).returning(UploadRow.id)
+        begun = update(UploadRow).where(*same).values(offset=0, holder=None, kept_by=None).returning(UploadRow.id)
         if session.scalar(begun) is None:
             return NOT_MENDED
     store.blobs.drop_partial(keys.scan_key(row.id))

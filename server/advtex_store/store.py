@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 from advtex_store.accounts import Accounts
 from advtex_store.batches import Batches
-from advtex_store.blobs import Blobs, open_blobs
+from advtex_store.blobs import Blobs
 from advtex_store.checks import Checks
 from advtex_store.database import Database
 from advtex_store.live import Live
 from advtex_store.live_progress import LiveProgress
 from advtex_store.overviews import Overviews
+from advtex_store.places import open_blobs
 from advtex_store.queue import JobQueue, connect_redis, connect_redis_briefly
 from advtex_store.records import Records
 from advtex_store.references import References

@@ -15,9 +15,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from advtex_store.blobs import CHUNK, Blobs, FolderBlobs, check_key, open_blobs
+from advtex_store.blobs import CHUNK, Blobs, FolderBlobs, check_key
 from advtex_store.bucket import Bucket
 from advtex_store.errors import BlobNotFound, BlobsRefused, BlobsUnavailable, NoSpace
+from advtex_store.places import open_blobs
 
 BIG = os.urandom(1 << 20) * 20  # more than one part of a multipart upload
 

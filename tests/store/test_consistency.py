@@ -14,6 +14,7 @@ from advtex_store.consistency import Disagreement, disagreements
 from advtex_store.database import upgrade_database
 from advtex_store.ids import new_id
 from advtex_store.models import JobRow, TallyRow
+from advtex_store.partials import Hold
 from advtex_store.settings import StoreSettings
 from advtex_store.store import Store, open_store
 
@@ -81,8 +82,9 @@ def test_a_job_whose_scan_is_gone_ends_with_that_reason_and_its_upload_can_be_se
     assert found(store) == []
     again = store.uploads.find("me", str(sha256))[0]
     assert (again.id, again.offset, again.sha256) == (upload, 0, None)
-    with store.blobs.resume(keys.scan_key(upload), len(SCAN), 0) as partial:
+    with store.blobs.resume(keys.scan_key(upload), len(SCAN), 0, Hold("h", None, lambda: None)) as partial:
         partial.write(SCAN)
+        partial.flush()
         partial.publish()
     store.uploads.finish(upload, str(sha256))
     assert store.records.retry(job).state == "queued"
@@ -140,12 +142,12 @@ def test_an_attempt_that_nobody_holds_is_given_up(store: Store, lease: float | N
 def test_an_upload_begins_anew_if_fewer_bytes_are_held_than_its_row_says(store: Store, told: int, whole: bool) -> None:
     """Of an older storage; one that holds more than the row of an older database knows of is gone on with."""
     upload = store.uploads.create("me", 1000)
-    with store.blobs.resume(keys.scan_key(upload.id), 1000, 0) as partial:
+    holder = str(store.uploads.seize(upload.id, "me").holder)
+    with store.blobs.resume(keys.scan_key(upload.id), 1000, 0, Hold(holder, None, lambda: None)) as partial:
         partial.write(SCAN[:4])
         partial.flush()
         partial.write(SCAN[4:5])
         partial.flush()
-    holder = str(store.uploads.seize(upload.id, "me").holder)
     store.uploads.advance(upload.id, holder, told)
     if whole:
         assert found(store) == []
@@ -154,7 +156,7 @@ def test_an_upload_begins_anew_if_fewer_bytes_are_held_than_its_row_says(store: 
     assert mend(store) == ["begins anew: its client sends it from the first byte on"]
     assert store.uploads.upload(upload.id).offset == 0
     assert found(store) == []
-    store.blobs.resume(keys.scan_key(upload.id), 1000, 0).close()
+    store.blobs.resume(keys.scan_key(upload.id), 1000, 0, Hold("h", None, lambda: None)).close()
 
 
 def test_jobs_that_ended_are_counted(store: Store, tmp_path: Path) -> None:

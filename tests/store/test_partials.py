@@ -15,10 +15,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from advtex_store import keys
-from advtex_store.blobs import Blobs, FolderBlobs, open_blobs
+from advtex_store.blobs import Blobs, FolderBlobs
 from advtex_store.bucket import Bucket
 from advtex_store.errors import BlobNotFound, BlobsUnavailable, NoSpace, Superseded
 from advtex_store.partials import Hold, Partial
+from advtex_store.places import open_blobs
 from advtex_store.s3 import S3Blobs
 
 PART = 1000

@@ -17,11 +17,12 @@ from hypothesis import strategies as st
 
 from advtex_contract.jobs import JobSpec
 from advtex_store import keys
-from advtex_store.blobs import Blobs, FolderBlobs, open_blobs
+from advtex_store.blobs import Blobs, FolderBlobs
 from advtex_store.errors import RecordNotFound, StoreError
 from advtex_store.ids import new_id
 from advtex_store.models import JobRow, UploadRow
 from advtex_store.partials import Hold, Partial, Unpublished
+from advtex_store.places import open_blobs
 from advtex_store.results import Results
 from advtex_store.retention import ORPHAN_SECONDS, SETTLED_SECONDS, Retention
 from advtex_store.s3 import S3Blobs

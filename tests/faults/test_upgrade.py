@@ -193,11 +193,11 @@ def test_a_fleet_is_upgraded_and_rolled_back_while_it_works(
         assert read_schema(running.settings.database).revision == revisions()[-1]
         upload_of_new = user.begin_upload(PRESENT_SIDE, data)
         from_both = user.go_on_with_upload(PRESENT_SIDE, upload_of_old, data)
-        # Where its bytes lie is nothing that the older release knows: it says so, and takes no byte.
+        # Where its bytes lie is nothing that the older release knows: its client has to begin anew.
         half = str(len(data) // 2)
         patch = {"Tus-Resumable": "1.0.0", "Content-Type": "application/offset+octet-stream", "Upload-Offset": half}
         user.ask(EARLIER_SIDE, "PATCH", upload_of_new, 404, content=data[len(data) // 2 :], headers=patch)
-        user.go_on_with_upload(PRESENT_SIDE, upload_of_new, data)
+        user.go_on_with_upload(PRESENT_SIDE, user.begin_upload(PRESENT_SIDE, data), data)
         for side in (EARLIER_SIDE, PRESENT_SIDE):
             use_everything(user, side, scan_of_old)
         row = running.store.records.job(begun_by_old)

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from advtex_client import _calls as calls
 from advtex_client._sending import Step, sending
 from advtex_client.errors import ClientError, ConflictError, NotFoundError, ScanRejectedError
-from advtex_client.memory import Submission, SubmissionMemory
+from advtex_client.submissions import Submission, SubmissionMemory
 from advtex_client.uploads import OnBytes, PackedScan
 from advtex_contract.errors import ErrorCode, ErrorDetail
 from advtex_contract.jobs import JobSpec, JobView

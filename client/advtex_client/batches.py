@@ -19,7 +19,7 @@ from advtex_client._submission import job_spec
 from advtex_client.client import Client
 from advtex_client.errors import ApiError, AuthError, BusyError, ClientError, NetworkError
 from advtex_client.manifests import BatchItem
-from advtex_client.memory import SubmissionMemory, write_whole
+from advtex_client.submissions import SubmissionMemory, write_whole
 from advtex_contract.errors import ErrorCode
 from advtex_contract.jobs import PENDING, BatchView, JobSpec, JobView
 from advtex_contract.options import JobOptions

@@ -22,7 +22,7 @@ from advtex_client._submission import ensure_submittable, job_spec, submission
 from advtex_client.config import load_config
 from advtex_client.downloads import Download, OnFileBytes, is_there, target_path
 from advtex_client.errors import ClientError, NotFoundError
-from advtex_client.memory import SubmissionMemory, upload_alone
+from advtex_client.submissions import SubmissionMemory, upload_alone
 from advtex_client.uploads import OnBytes, PackedScan, packed
 from advtex_contract.health import KeyView, Readiness
 from advtex_contract.jobs import BatchView, JobSpec, JobState, JobView, ResultFile, UploadView

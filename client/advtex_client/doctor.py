@@ -8,7 +8,7 @@ from datetime import UTC
 
 from advtex_client.client import Client
 from advtex_client.errors import ClientError
-from advtex_client.memory import check_writable
+from advtex_client.submissions import check_writable
 from advtex_contract.health import KeyView
 
 

@@ -10,8 +10,8 @@ from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from advtex_server.browsers import Guests, session_token
-from advtex_server.doorkeeper import Doorkeeper
+from advtex_server.authentication import Authenticator
+from advtex_server.browsers import BrowserSessions, session_token
 from advtex_server.errors import respond
 from advtex_store.accounts import Caller
 
@@ -22,10 +22,12 @@ UPLOADS = "/v1/uploads"
 class AccessMiddleware:
     """Sets `scope["state"]["caller"]`, and `ask_caller` that finds out again, for everything below `/v1/`."""
 
-    def __init__(self, app: ASGIApp, doorkeeper: Doorkeeper, guests: Guests, max_body_bytes: int) -> None:
+    def __init__(
+        self, app: ASGIApp, authenticator: Authenticator, browser_sessions: BrowserSessions, max_body_bytes: int
+    ) -> None:
         self.app = app
-        self.doorkeeper = doorkeeper
-        self.guests = guests
+        self.authenticator = authenticator
+        self.browser_sessions = browser_sessions
         self.max_body_bytes = max_body_bytes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -47,8 +49,8 @@ class AccessMiddleware:
     async def _caller(self, connection: HTTPConnection) -> Caller:
         authorization = connection.headers.get("authorization", "")
         if not authorization and session_token(connection):
-            return await self.guests.caller(connection)
-        return await self.doorkeeper.caller(authorization, connection.client.host if connection.client else "")
+            return await self.browser_sessions.caller(connection)
+        return await self.authenticator.caller(authorization, connection.client.host if connection.client else "")
 
     def _limited(self, headers: Headers, receive: Receive) -> Receive:
         # An HTTPException, because FastAPI turns all others that come up while a body is read into a plain 400.

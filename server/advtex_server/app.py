@@ -11,12 +11,12 @@ from fastapi import FastAPI
 from advtex_scan.version import product_version
 from advtex_server import errors
 from advtex_server.access import AccessMiddleware
+from advtex_server.authentication import Authenticator
 from advtex_server.bodies import OpenBodies
-from advtex_server.browsers import BrowserHeadersMiddleware, Guests
+from advtex_server.browsers import BrowserHeadersMiddleware, BrowserSessions
 from advtex_server.checking import Checker
 from advtex_server.deliveries import Deliverer
 from advtex_server.dispatch import Dispatcher
-from advtex_server.doorkeeper import Doorkeeper
 from advtex_server.events import Lookout
 from advtex_server.intake import Intake
 from advtex_server.metrics import Metrics, MetricsMiddleware
@@ -77,10 +77,15 @@ def create_app(settings: ServerSettings) -> FastAPI:
     app.state.bodies = OpenBodies()
     app.state.lookout = Lookout(app.state.service)
     errors.install(app)
-    doorkeeper = Doorkeeper(store.accounts, settings.auth_failures_per_minute)
-    guests = Guests(store.sessions)
-    app.state.doorkeeper, app.state.guests = doorkeeper, guests
-    app.add_middleware(AccessMiddleware, doorkeeper=doorkeeper, guests=guests, max_body_bytes=settings.max_body_bytes)
+    authenticator = Authenticator(store.accounts, settings.auth_failures_per_minute)
+    browser_sessions = BrowserSessions(store.sessions)
+    app.state.authenticator, app.state.browser_sessions = authenticator, browser_sessions
+    app.add_middleware(
+        AccessMiddleware,
+        authenticator=authenticator,
+        browser_sessions=browser_sessions,
+        max_body_bytes=settings.max_body_bytes,
+    )
     app.add_middleware(OlderClientsMiddleware)
     app.add_middleware(TusMiddleware)
     app.add_middleware(MetricsMiddleware, metrics=metrics)

@@ -13,7 +13,7 @@ from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from advtex_contract.errors import ErrorCode
-from advtex_server.doorkeeper import KNOWN_SECONDS, remember, unauthorized
+from advtex_server.authentication import KNOWN_SECONDS, remember, unauthorized
 from advtex_server.refusal import ApiError
 from advtex_store.accounts import Caller
 from advtex_store.sessions import Sessions
@@ -31,7 +31,7 @@ HEADERS = {
 """Of every answer that does not say otherwise; pages have a policy of their own."""
 
 
-class Guests:
+class BrowserSessions:
     """Knows callers by their session, without a look at the database for every request."""
 
     def __init__(self, sessions: Sessions) -> None:

@@ -34,7 +34,7 @@ from advtex_store.errors import (
     StaleAttempt,
     StoreError,
 )
-from advtex_store.needs import needed_memory
+from advtex_store.memory_estimate import needed_memory
 from advtex_store.references import RemoteScan
 from advtex_store.secrecy import public_environment
 from advtex_store.store import Store

@@ -87,7 +87,7 @@ def _workers(store: Store) -> Check:
     if not living:
         return Check("workers", False, False, "no worker is running, jobs are accepted and wait: start advtex-worker")
     try:
-        pauses = store.tallies.pauses()
+        pauses = store.counters.pauses()
     except SQLAlchemyError:  # told by its own check
         pauses = []
     if pauses:

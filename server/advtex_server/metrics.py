@@ -13,8 +13,8 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from advtex_contract.jobs import WAITING, JobState
+from advtex_store.counters import ATTEMPTS, FAILURES, JOBS, STAGES
 from advtex_store.store import Store
-from advtex_store.tallies import ATTEMPTS, FAILURES, JOBS, STAGES
 
 
 class Metrics:
@@ -54,7 +54,7 @@ class FleetCollector(Collector):
         for state in JobState:
             jobs.add_metric([state.value], counts.get(state.value, 0))
         yield jobs
-        load = self.store.tallies.load()
+        load = self.store.counters.load()
         yield GaugeMetricFamily("advtex_queue_depth", "Jobs that wait", sum(counts.get(state, 0) for state in WAITING))
         yield GaugeMetricFamily("advtex_queue_age_seconds", "Age of the oldest job that waits", load.oldest_seconds)
         yield GaugeMetricFamily("advtex_steps_per_second", "Of all running jobs together", load.steps_per_second)
@@ -84,7 +84,7 @@ class FleetCollector(Collector):
             JOBS: CounterMetricFamily("advtex_jobs_ended", "Jobs that ended, by state", labels=["state"]),
         }
         stages = SummaryMetricFamily("advtex_stage_seconds", "Time in stages, of jobs that ended", labels=["stage"])
-        for row in self.store.tallies.counts():
+        for row in self.store.counters.counts():
             if row.name == STAGES:
                 stages.add_metric([row.label], count_value=row.count, sum_value=row.total)
             elif row.name in families:

@@ -17,13 +17,13 @@ from sqlalchemy import func, select, update
 
 from advtex_contract.jobs import TERMINAL, WAITING, JobError, JobState
 from advtex_store import keys
+from advtex_store.counters import JOBS, count_end
 from advtex_store.errors import BlobNotFound, IllegalTransition, RecordNotFound, StaleAttempt
 from advtex_store.ids import ID, created_at
-from advtex_store.models import EventRow, JobRow, TallyRow, UploadRow
+from advtex_store.models import CounterRow, EventRow, JobRow, UploadRow
 from advtex_store.partials import Hold
 from advtex_store.retention import ORPHAN_SECONDS
 from advtex_store.store import Store
-from advtex_store.tallies import JOBS, tally_end
 from advtex_store.uploads import INCOMPLETE_SECONDS
 from advtex_store.webhooks import tell_webhooks
 
@@ -60,7 +60,7 @@ def disagreements(store: Store) -> Iterator[Disagreement]:
             message = f"attempt {job.attempt} of worker {job.worker} runs, and its lease has run out"
             yield Disagreement("leases", job.id, message, lambda job=job: _give_up(store, job))  # type: ignore[misc]
     yield from _orphans(store, sizes)
-    yield from _tallies(store)
+    yield from _counters(store)
 
 
 # -- scans ------------------------------------------------------------------------------------------------------------
@@ -159,7 +159,7 @@ def _make_again(store: Store, job: JobRow) -> str:
         data = {"kind": "state", "state": "failed", "attempt": row.attempt, "at": now}
         session.add(EventRow(job_id=row.id, version=row.version, data=data))
         tell_webhooks(session, row, now)
-        tally_end(session, row.state, row.error, {})
+        count_end(session, row.state, row.error, {})
     store.blobs.delete(keys.result_manifest_key(job.id))  # else the next look would take the job for finished
     if job.source is None and not store.blobs.exists(keys.scan_key(job.upload_id)):
         return "failed: its results are gone, and so is its scan"
@@ -201,23 +201,23 @@ def _orphans(store: Store, sizes: Mapping[str, int]) -> Iterator[Disagreement]:
             yield Disagreement("orphans", owner, f"{message}servers remove them from {end:%Y-%m-%d %H:%M} UTC on")
 
 
-def _tallies(store: Store) -> Iterator[Disagreement]:
+def _counters(store: Store) -> Iterator[Disagreement]:
     """No fewer jobs can have ended in a state than are in it; more can, since jobs are retried."""
     ended = select(JobRow.state, func.count()).where(JobRow.state.in_(TERMINAL)).group_by(JobRow.state)
     with store.database.read() as session:
         rows = {state: int(count) for state, count in session.execute(ended)}
-        told = {row.label: row.count for row in session.scalars(select(TallyRow).where(TallyRow.name == JOBS))}
+        told = {row.label: row.count for row in session.scalars(select(CounterRow).where(CounterRow.name == JOBS))}
     for state, count in sorted(rows.items()):
         if told.get(state, 0) < count:
             message = f"{told.get(state, 0)} jobs are counted as {state}, and {count} are"
-            yield Disagreement("tallies", state, message, lambda s=state, n=count: _count(store, s, n))  # type: ignore[misc]
+            yield Disagreement("counters", state, message, lambda s=state, n=count: _count(store, s, n))  # type: ignore[misc]
 
 
 def _count(store: Store, state: str, count: int) -> str:
     with store.database.write() as session:
-        row = session.get(TallyRow, (JOBS, state), with_for_update=True)
+        row = session.get(CounterRow, (JOBS, state), with_for_update=True)
         if row is None:
-            session.add(TallyRow(name=JOBS, label=state, count=count, total=0.0))
+            session.add(CounterRow(name=JOBS, label=state, count=count, total=0.0))
         else:
             row.count = max(row.count, count)
     return f"counted: {count}"

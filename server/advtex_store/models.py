@@ -113,7 +113,7 @@ class JobRow(Base):
     reached, reached_at_claim, deaths: how far any attempt got, where this one began, and how many attempts in a row
     died without getting farther.
     source: the URL of a scan that stays where it is; its upload row is a mere placeholder.
-    memory_bytes: what a worker must have (`needs.py`). memory_gib: the same as the class of the smallest such worker.
+    memory_bytes: what a worker must have (`memory_estimate.py`). memory_gib: the class of the smallest such worker.
     waiting_reason: for people, the dispatcher's while the job waits and the worker's while it pauses.
     checked_at: when its scan was found good. Until then `worker`, `lease_expires_at` and `deaths` are the checker's
     (`checks.py`); a time without a worker is when the next check may begin.
@@ -199,7 +199,7 @@ class IdempotencyRow(Base):
     created_at: Mapped[float]
 
 
-class TallyRow(Base):
+class CounterRow(Base):
     """What has happened so far, counted in the transaction in which it happened: the metrics of the whole fleet."""
 
     __tablename__ = "tallies"

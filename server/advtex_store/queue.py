@@ -23,7 +23,7 @@ from rq.exceptions import DuplicateJobError, NoSuchJobError
 from rq.job import Job
 from rq.serializers import JSONSerializer
 
-from advtex_store.needs import GIB
+from advtex_store.memory_estimate import GIB
 from advtex_store.settings import StoreSettings
 
 QUEUE = "advtex-"

@@ -42,12 +42,12 @@ from advtex_contract.jobs import RETRYABLE, STATES, TERMINAL, WAITING, JobError,
 from advtex_contract.options import JobOptions
 from advtex_store import keys
 from advtex_store.accounts import check_active_jobs
+from advtex_store.counters import ATTEMPTS, count_end, count_one
 from advtex_store.database import Database
 from advtex_store.errors import IllegalTransition, RecordNotFound, StaleAttempt
 from advtex_store.fair_queue import WaitingJob, distinct_pairs, next_jobs, use_order_of_index
+from advtex_store.memory_estimate import GIB
 from advtex_store.models import KEPT, WAITS_FOR_A_REASON, EventRow, JobRow
-from advtex_store.needs import GIB
-from advtex_store.tallies import ATTEMPTS, tally, tally_end
 from advtex_store.troubles import ADOPT, not_aside
 from advtex_store.webhooks import tell_webhooks
 
@@ -195,7 +195,7 @@ class Records:
                 self.finish(session, self.move(session, job_id, S.canceled, fence=attempt))
                 return S.canceled
             self.move(session, job_id, S.preempted, fence=attempt, **_released(attempt + 1))
-            tally(session, ATTEMPTS, "preempted")
+            count_one(session, ATTEMPTS, "preempted")
             return S.preempted
 
     def lost(self, job_id: str, attempt: int, *, log_tail: str | None = None, expired_only: bool = False) -> JobState:
@@ -209,7 +209,7 @@ class Records:
                 raise StaleAttempt(f"job {job_id}: the lease of attempt {attempt} still holds")
             if log_tail is not None:
                 row.log_tail = log_tail
-            tally(session, ATTEMPTS, "lost")
+            count_one(session, ATTEMPTS, "lost")
             deaths = 1 if row.reached > row.reached_at_claim else row.deaths + 1
             if row.cancel_requested:
                 self.finish(session, self.move(session, job_id, S.canceled, fence=attempt))
@@ -384,7 +384,7 @@ class Records:
         row.cancel_requested = False
         for name, value in values.items():
             setattr(row, name, value)
-        tally_end(session, row.state, row.error, row.progress.get("stage_seconds", {}))
+        count_end(session, row.state, row.error, row.progress.get("stage_seconds", {}))
         return row
 
     def _why_stale(self, session: Session, job_id: str, attempt: int) -> str:

@@ -8,6 +8,7 @@ from advtex_store.accounts import Accounts
 from advtex_store.batches import Batches
 from advtex_store.blobs import Blobs
 from advtex_store.checks import Checks
+from advtex_store.counters import Counters
 from advtex_store.database import Database
 from advtex_store.live import Live
 from advtex_store.live_progress import LiveProgress
@@ -20,7 +21,6 @@ from advtex_store.results import Results
 from advtex_store.sessions import Sessions
 from advtex_store.settings import StoreSettings
 from advtex_store.submissions import Submissions
-from advtex_store.tallies import Tallies
 from advtex_store.troubles import Troubles
 from advtex_store.uploads import Uploads
 from advtex_store.webhooks import Webhooks
@@ -46,7 +46,7 @@ class Store:
     live: Live
     live_progress: LiveProgress
     webhooks: Webhooks
-    tallies: Tallies
+    counters: Counters
     troubles: Troubles
     queue: JobQueue
 
@@ -80,7 +80,7 @@ def open_store(settings: StoreSettings) -> Store:
         live=Live(blobs),
         live_progress=LiveProgress(connect_redis_briefly(settings)),
         webhooks=Webhooks(database),
-        tallies=Tallies(database),
+        counters=Counters(database),
         troubles=Troubles(database, blobs),
         queue=JobQueue(connect_redis(settings)),
     )

@@ -42,8 +42,8 @@ from advtex_server.settings import ServerSettings
 from advtex_store.database import upgrade_database
 from advtex_store.errors import StaleAttempt
 from advtex_store.ids import new_id
+from advtex_store.memory_estimate import GIB
 from advtex_store.models import EventRow, JobRow, UploadRow
-from advtex_store.needs import GIB
 from advtex_store.queue import attempt_of, queue_name
 from advtex_store.retention import HIDDEN, Retention
 from advtex_store.store import Store, open_store

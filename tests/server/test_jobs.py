@@ -17,8 +17,8 @@ from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from advtex_contract.jobs import JobError, JobPage, JobView, Progress
 from advtex_server.events import FRESH_SECONDS, Lookout
 from advtex_store.errors import RecordNotFound, StaleAttempt
+from advtex_store.memory_estimate import needed_memory
 from advtex_store.models import JobRow
-from advtex_store.needs import needed_memory
 
 
 def lasting(view: dict[str, Any]) -> dict[str, Any]:

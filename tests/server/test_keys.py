@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from advtex_contract.health import KeyView
-from advtex_server.doorkeeper import KNOWN_SECONDS, Doorkeeper
+from advtex_server.authentication import KNOWN_SECONDS, Authenticator
 from advtex_server.refusal import ApiError
 from advtex_store.accounts import Caller
 
@@ -32,12 +32,12 @@ class FakeAccounts:
 
 
 class Door:
-    """A doorkeeper with a clock that is set by hand."""
+    """A authenticator with a clock that is set by hand."""
 
     def __init__(self, limit: int = 5) -> None:
         self.now = 0.0
         self.accounts = FakeAccounts()
-        self._keeper = Doorkeeper(self.accounts, limit, lambda: self.now)  # type: ignore[arg-type]
+        self._keeper = Authenticator(self.accounts, limit, lambda: self.now)  # type: ignore[arg-type]
 
     def knock(self, authorization: str, address: str = "1.1.1.1") -> int:
         """-> the status that the request would get."""

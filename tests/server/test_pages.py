@@ -18,8 +18,8 @@ import pytest
 from advtex_contract.jobs import RETRYABLE, STATES, TERMINAL
 from advtex_contract.stages import STAGE_LABELS
 from advtex_server import static_files
+from advtex_server.authentication import KNOWN_SECONDS
 from advtex_server.browsers import HEADERS
-from advtex_server.doorkeeper import KNOWN_SECONDS
 
 pytestmark = pytest.mark.one_machine("the page asks what tests/store has on both databases")
 FIRST_PAGE_BYTES = 100_000

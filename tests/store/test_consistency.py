@@ -13,7 +13,7 @@ from advtex_store import keys
 from advtex_store.consistency import Disagreement, disagreements
 from advtex_store.database import upgrade_database
 from advtex_store.ids import new_id
-from advtex_store.models import JobRow, TallyRow
+from advtex_store.models import CounterRow, JobRow
 from advtex_store.partials import Hold
 from advtex_store.settings import StoreSettings
 from advtex_store.store import Store, open_store
@@ -162,8 +162,8 @@ def test_an_upload_begins_anew_if_fewer_bytes_are_held_than_its_row_says(store: 
 def test_jobs_that_ended_are_counted(store: Store, tmp_path: Path) -> None:
     succeeded(store, tmp_path)
     with store.database.write() as session:
-        session.query(TallyRow).delete()
-    assert found(store) == [("tallies", "succeeded")]
+        session.query(CounterRow).delete()
+    assert found(store) == [("counters", "succeeded")]
     assert mend(store) == ["counted: 1"]
     assert found(store) == []
 

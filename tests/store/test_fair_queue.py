@@ -16,8 +16,8 @@ from sqlalchemy.orm import Session
 from advtex_contract.jobs import JobState, Progress
 from advtex_contract.options import JobOptions
 from advtex_store.ids import new_id
+from advtex_store.memory_estimate import GIB
 from advtex_store.models import JobRow
-from advtex_store.needs import GIB
 from advtex_store.records import EXPLAINED, WAITING
 
 STATES = (JobState.queued, JobState.queued, JobState.preempted, JobState.running, JobState.succeeded)

@@ -15,6 +15,7 @@ from advtex_contract.jobs import TERMINAL, JobSpec
 from advtex_store.accounts import Accounts
 from advtex_store.batches import Batches
 from advtex_store.checks import Checks
+from advtex_store.counters import Counters
 from advtex_store.database import Database, connect, migrate_database, read_schema, upgrade_database
 from advtex_store.errors import SchemaRefused
 from advtex_store.models import Base
@@ -22,7 +23,6 @@ from advtex_store.overviews import Overviews
 from advtex_store.records import Records
 from advtex_store.schema import GENERATION_DIGITS, revisions
 from advtex_store.submissions import JobFilter, Submissions
-from advtex_store.tallies import Tallies
 from advtex_store.uploads import Uploads
 
 REVISIONS = revisions()
@@ -72,7 +72,7 @@ def check_works(url: str) -> None:
     for batch in {job.batch for job in jobs if job.batch}:
         assert Batches(database).batch("ada", batch).states
     assert Accounts(database).usage("ada").active_jobs == sum(job.state not in TERMINAL for job in jobs)
-    assert Tallies(database).load().oldest_seconds > 0
+    assert Counters(database).load().oldest_seconds > 0
     assert Uploads(database).find("ada", "ab" * 32) is not None
     assert {job.state for job in records.waiting(10)} == {"queued", "preempted"}
     database.close()

@@ -14,7 +14,7 @@ import pytest
 from live_service import process_tree, wait_until
 
 from advtex_contract.options import JobOptions
-from advtex_store.needs import GIB
+from advtex_store.memory_estimate import GIB
 from advtex_worker.adapt import texture_config
 from advtex_worker.locks import first_lock, lock_paths
 from advtex_worker.memory import Gpu, list_gpus

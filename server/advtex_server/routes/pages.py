@@ -21,9 +21,9 @@ from advtex_contract.options import METHOD_HELP, PRESET_COST, PRESET_HELP, JobOp
 from advtex_contract.stages import STAGE_LABELS
 from advtex_scan.layouts import LAYOUT_NAMES
 from advtex_server import static_files
-from advtex_server.browsers import Guests, check_same_origin, cookie_name
+from advtex_server.authentication import Authenticator
+from advtex_server.browsers import BrowserSessions, check_same_origin, cookie_name
 from advtex_server.deps import TheService
-from advtex_server.doorkeeper import Doorkeeper
 from advtex_server.errors import noted
 from advtex_server.overview import job_summary, stream_changes
 from advtex_server.refusal import ApiError
@@ -141,14 +141,14 @@ async def changes(
     request: Request, service: TheService, after: int = 0, last_event_id: Annotated[str, Header()] = ""
 ) -> Response:
     """Server-sent events: every change of a job after a time in milliseconds."""
-    caller = await _guests(request).find(request)
+    caller = await _sessions(request).find(request)
     if caller is None or "read" not in caller.scopes:
         return Response(status_code=401)
     since = int(last_event_id) if last_event_id.isascii() and last_event_id.isdigit() else after
     stopping = request.app.state.stopping
     events = stream_changes(service.store.overviews, caller.owner, min(since, 2**50) / 1000, stopping)
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-    events = while_welcome(events, partial(_guests(request).find, request))
+    events = while_welcome(events, partial(_sessions(request).find, request))
     return StreamingResponse(events, media_type="text/event-stream", headers=headers)
 
 
@@ -166,7 +166,7 @@ async def sign_in_page(
             )
             return _page("sign_in.html", None, status=401, problem=problem, next="/")
         return _signed_in(request, session, seconds, "/")
-    if await _guests(request).find(request) is not None:
+    if await _sessions(request).find(request) is not None:
         return RedirectResponse(_return(next_), 303)
     return _page("sign_in.html", None, problem="", next=_return(next_))
 
@@ -177,10 +177,10 @@ async def sign_in(request: Request, service: TheService) -> Response:
     check_same_origin(request.headers)
     form = parse_qs((await request.body()).decode(errors="replace"))
     following = _return(form.get("next", ["/"])[0])
-    doorkeeper = cast(Doorkeeper, request.app.state.doorkeeper)
+    authenticator = cast(Authenticator, request.app.state.authenticator)
     key = form.get("key", [""])[0].strip()
     try:
-        caller = await doorkeeper.caller(f"Bearer {key}", request.client.host if request.client else "")
+        caller = await authenticator.caller(f"Bearer {key}", request.client.host if request.client else "")
     except ApiError as error:
         problem = "This key is unknown, revoked or expired." if error.status == 401 else str(error)
         return _page("sign_in.html", None, status=error.status, problem=problem, next=following)
@@ -193,7 +193,7 @@ async def sign_in(request: Request, service: TheService) -> Response:
 async def sign_out(request: Request) -> Response:
     """End the session, here and on the server."""
     check_same_origin(request.headers)
-    await _guests(request).end(request)
+    await _sessions(request).end(request)
     response = RedirectResponse("/sign-in", 303)
     response.delete_cookie(cookie_name(request.headers), httponly=True, samesite="strict")
     return response
@@ -206,12 +206,12 @@ async def static(version: str, name: str, request: Request) -> Response:
     return found or Response(f"there is no {name}", 404, media_type="text/plain")
 
 
-def _guests(request: Request) -> Guests:
-    return cast(Guests, request.app.state.guests)
+def _sessions(request: Request) -> BrowserSessions:
+    return cast(BrowserSessions, request.app.state.browser_sessions)
 
 
 async def _reader(request: Request) -> Caller:
-    caller = await _guests(request).find(request)
+    caller = await _sessions(request).find(request)
     if caller is None:
         raise SignInFirst
     if "read" not in caller.scopes:

@@ -29,7 +29,7 @@ from advtex_engine.runtime.available_memory import available_memory
 from advtex_engine.runtime.shortage import memory_problem
 from advtex_engine.synthetic.planar import planar_views
 from advtex_engine.synthetic.scan import synthesize
-from advtex_store.needs import needed_memory
+from advtex_store.memory_estimate import needed_memory
 
 CPU = torch.device("cpu")
 VIEWS = 2

@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 
 from advtex_contract.jobs import JobState
 from advtex_store.database import Database
-from advtex_store.models import KEPT, DeliveryRow, JobRow, TallyRow
+from advtex_store.models import KEPT, CounterRow, DeliveryRow, JobRow
 
 # In the order in which one transaction may count: all in the same, or two of them could wait for each other.
 ATTEMPTS = "attempts"  # ended early, by how: lost, preempted
@@ -31,39 +31,39 @@ class Load:
     deliveries: int
 
 
-def tally(session: Session, name: str, label: str, total: float = 0.0) -> None:
+def count_one(session: Session, name: str, label: str, total: float = 0.0) -> None:
     """Count one more, inside the transaction in which it happens."""
     insert = sqlite.insert if session.get_bind().dialect.name == "sqlite" else postgresql.insert
-    statement = insert(TallyRow).values(name=name, label=label[:255], count=1, total=total)
+    statement = insert(CounterRow).values(name=name, label=label[:255], count=1, total=total)
     session.execute(
         statement.on_conflict_do_update(
             index_elements=["name", "label"],
-            set_={"count": TallyRow.count + 1, "total": TallyRow.total + total},
+            set_={"count": CounterRow.count + 1, "total": CounterRow.total + total},
         )
     )
 
 
-def tally_end(
+def count_end(
     session: Session, state: str, error: Mapping[str, Any] | None, stage_seconds: Mapping[str, float]
 ) -> None:
     """Count a job that has ended."""
     if error is not None:
-        tally(session, FAILURES, str(error["code"]))
-    tally(session, JOBS, state)
+        count_one(session, FAILURES, str(error["code"]))
+    count_one(session, JOBS, state)
     for stage, seconds in sorted(stage_seconds.items()):
-        tally(session, STAGES, stage, seconds)
+        count_one(session, STAGES, stage, seconds)
 
 
-class Tallies:
+class Counters:
     """The counts, for those who watch the service."""
 
     def __init__(self, database: Database) -> None:
         self.database = database
 
-    def counts(self) -> list[TallyRow]:
+    def counts(self) -> list[CounterRow]:
         """All of them."""
         with self.database.read() as session:
-            return list(session.scalars(select(TallyRow).order_by(TallyRow.name, TallyRow.label)))
+            return list(session.scalars(select(CounterRow).order_by(CounterRow.name, CounterRow.label)))
 
     def pauses(self) -> list[str]:
         """Why running jobs pause, each reason once."""

@@ -11,7 +11,7 @@ from advtex_contract.options import JobOptions, Preset
 from advtex_engine.core.config import TextureConfig
 from advtex_engine.ingest.frames import MAX_HELDOUT, MAX_MAP_BYTES
 from advtex_engine.mesh.fusion import MAX_VOXEL_BYTES
-from advtex_store.needs import (
+from advtex_store.memory_estimate import (
     BASE,
     GIB,
     MAX_FUSED,

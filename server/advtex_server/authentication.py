@@ -21,7 +21,7 @@ KNOWN_SECONDS = 2.0  # a key is looked up this often at most; a revoked one work
 REMEMBERED = 10_000  # keys, and addresses that failed
 
 
-class Doorkeeper:
+class Authenticator:
     """`failures_per_minute`: wrong keys from one address; beyond it the address is refused without a look, except for
     keys that are known to be good."""
 

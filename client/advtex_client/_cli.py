@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from pydantic import ValidationError
 
 from advtex_client._display import Display
 from advtex_client.doctor import ServerNotReady
@@ -25,8 +23,7 @@ from advtex_client.errors import (
     WaitTimeoutError,
 )
 from advtex_client.manifests import retention_seconds
-from advtex_contract.options import METHOD_HELP, PRESET_HELP, JobOptions, Method, Preset
-from advtex_scan.layouts import LAYOUT_NAMES
+from advtex_contract.options import JobOptions, chosen_options
 
 EXIT_CODES: dict[type[ClientError], int] = {
     AuthError: 3,
@@ -43,12 +40,6 @@ USAGE = 2
 INTERRUPTED = 130
 
 
-def _known_layout(name: str | None) -> str | None:
-    if name is not None and name not in LAYOUT_NAMES:
-        raise typer.BadParameter(f"{name!r} is no layout; choose one of {', '.join(LAYOUT_NAMES)}")
-    return name
-
-
 ScanPath = Annotated[Path, typer.Argument(exists=True, readable=True, help="a scan: a folder, zip, .r3d or .sens")]
 JobId = Annotated[str, typer.Argument(help="the job's id, as `submit` prints it", metavar="JOB")]
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON on stdout")]
@@ -56,23 +47,6 @@ Url = Annotated[str | None, typer.Option("--url", help="the server; else ADVTEX_
 ApiKey = Annotated[str | None, typer.Option("--api-key", help="the key; better given as ADVTEX_API_KEY")]
 Seconds = Annotated[float | None, typer.Option("--timeout", min=0, help="stop waiting after this many seconds")]
 Folder = Annotated[Path | None, typer.Option("-o", "--output", help="fetch the results into this folder")]
-_METHODS = "; ".join(f"{method}: {text}" for method, text in METHOD_HELP.items())
-_PRESETS = "; ".join(f"{preset}: {text}" for preset, text in PRESET_HELP.items())
-
-PresetOption = Annotated[Preset, typer.Option("--preset", help=_PRESETS)]
-MethodOption = Annotated[Method, typer.Option("--method", help=_METHODS)]
-SizeOption = Annotated[str | None, typer.Option("--size", metavar="WxH", help="working size of the views, pixels")]
-HoldoutOption = Annotated[int | None, typer.Option("--holdout", help="leave out every Nth frame and score on it")]
-StepsOption = Annotated[int | None, typer.Option("--steps", help="overrides the preset's step count")]
-LayoutOption = Annotated[
-    str | None,
-    typer.Option(
-        "--layout",
-        metavar="NAME",
-        callback=_known_layout,
-        help=f"how the files are laid out; else found out. One of {', '.join(LAYOUT_NAMES)}",
-    ),
-]
 PriorityOption = Annotated[int, typer.Option("--priority", min=-100, max=100, help="larger runs earlier")]
 KeepOption = Annotated[
     float | None, typer.Option("--keep-days", help="how long a job is kept after its end; else the server's usual time")
@@ -98,16 +72,6 @@ def command(as_json: bool) -> Iterator[Display]:
         raise typer.Exit(INTERRUPTED) from error
 
 
-def parsed_size(size: str | None) -> tuple[int | None, int | None]:
-    """Return the width and height that `--size` names, in pixels. Raises ClientError."""
-    if size is None:
-        return None, None
-    match = re.fullmatch(r"(\d{1,6})[x×](\d{1,6})", size.strip().lower())
-    if match is None:
-        raise ClientError(f"--size {size!r} is no size; give it as WxH in pixels, for example 320x240")
-    return int(match[1]), int(match[2])
-
-
 def retention(keep_days: float | None) -> int | None:
     """Return `--keep-days` in seconds. Raises ClientError."""
     try:
@@ -116,11 +80,9 @@ def retention(keep_days: float | None) -> int | None:
         raise ClientError(f"--keep-days {keep_days}: {error}") from error
 
 
-def job_options(**given: object) -> JobOptions:
-    """Return the options, those that were not given at their defaults. Raises ClientError for one out of bounds."""
+def job_options(given: Mapping[str, object]) -> JobOptions:
+    """Return the options of the flags that were given. Raises ClientError for one that cannot be used."""
     try:
-        return JobOptions.model_validate({name: value for name, value in given.items() if value is not None})
-    except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(str(part) for part in first["loc"])
-        raise ClientError(f"option {field}={first['input']!r} is out of bounds: {first['msg']}") from error
+        return chosen_options(given)
+    except ValueError as error:
+        raise ClientError(str(error)) from error

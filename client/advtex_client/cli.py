@@ -6,7 +6,7 @@ Exit codes: 0 ok, 2 usage, 3 auth, 4 rejected scan, 5 job failed, 6 network, 7 t
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -17,22 +17,15 @@ from advtex_client._cli import (
     ApiKey,
     AsJson,
     Folder,
-    HoldoutOption,
     JobId,
     KeepOption,
-    LayoutOption,
-    MethodOption,
-    PresetOption,
     PriorityOption,
     ScanPath,
     Seconds,
-    SizeOption,
-    StepsOption,
     Url,
     command,
     exit_code_of,
     job_options,
-    parsed_size,
     retention,
 )
 from advtex_client._display import Display, finding_lines, job_lines, job_table
@@ -41,7 +34,7 @@ from advtex_client.deep import deep_lines, deep_report
 from advtex_client.doctor import examine
 from advtex_client.errors import ScanRejectedError
 from advtex_contract.jobs import RETRYABLE, TERMINAL, JobState, JobView
-from advtex_contract.options import Method, Preset
+from advtex_options.flags import LayoutFlag, option_flags
 from advtex_scan.check import check_scan
 from advtex_scan.version import product_version
 
@@ -76,7 +69,7 @@ def check(
     deep: Annotated[
         bool, typer.Option("--deep", help="also measure whether depth, mesh, colors and poses agree; needs the engine")
     ] = False,
-    layout: LayoutOption = None,
+    layout: LayoutFlag = None,
     as_json: AsJson = False,
 ) -> None:
     """Check a scan on this computer: every problem, where it is, and what helps."""
@@ -93,18 +86,10 @@ def check(
 
 
 @app.command()
+@option_flags
 def submit(
     scan: ScanPath,
-    preset: PresetOption = Preset.auto,
-    method: MethodOption = Method.adversarial,
-    size: SizeOption = None,
-    holdout: HoldoutOption = None,
-    steps: StepsOption = None,
-    seed: Annotated[int | None, typer.Option(help="of the random numbers")] = None,
-    face_budget: Annotated[int | None, typer.Option(help="decimate the mesh to this many faces")] = None,
-    max_views: Annotated[int | None, typer.Option(help="choose this many frames of a longer scan")] = None,
-    max_texture_size: Annotated[int | None, typer.Option(help="cap on the texture's side, texels")] = None,
-    layout: LayoutOption = None,
+    given: dict[str, Any],
     label: Annotated[str, typer.Option(help="a name of your own for the job")] = "",
     priority: PriorityOption = 0,
     keep_days: KeepOption = None,
@@ -118,20 +103,7 @@ def submit(
 ) -> None:
     """Check a scan, send it and queue a job. Run again, it goes on with the same job. -o waits and fetches."""
     with command(as_json) as display:
-        width, height = parsed_size(size)
-        options = job_options(
-            preset=preset,
-            method=method,
-            width=width,
-            height=height,
-            steps=steps,
-            face_budget=face_budget,
-            max_views=max_views,
-            max_texture_size=max_texture_size,
-            holdout=holdout,
-            seed=seed,
-            layout=layout,
-        )
+        options = job_options(given)
         kept = retention(keep_days)
         with Client(url, api_key) as client:
             with display.bytes_bar("sending") as bar:

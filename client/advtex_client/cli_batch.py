@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -13,18 +13,12 @@ from advtex_client._cli import (
     EXIT_CODES,
     ApiKey,
     AsJson,
-    HoldoutOption,
     KeepOption,
-    MethodOption,
-    PresetOption,
     PriorityOption,
     Seconds,
-    SizeOption,
-    StepsOption,
     Url,
     command,
     job_options,
-    parsed_size,
     retention,
 )
 from advtex_client._display import Display, batch_line, batch_table, finding_lines
@@ -33,7 +27,7 @@ from advtex_client.client import Client
 from advtex_client.errors import ClientError, JobFailedError, ScanRejectedError, WaitTimeoutError
 from advtex_client.manifests import read_items
 from advtex_contract.jobs import BatchView, JobState
-from advtex_contract.options import Method, Preset
+from advtex_options.flags import option_flags
 
 POLL_SECONDS = 2.0
 
@@ -44,19 +38,16 @@ Wait = Annotated[bool, typer.Option("--wait", help="until every job has ended; t
 
 
 @app.command()
+@option_flags
 def submit(
     scans: Annotated[
         Path, typer.Argument(exists=True, readable=True, help="a folder of scans, or a manifest (.csv, .jsonl)")
     ],
+    given: dict[str, Any],
     batch: Annotated[str | None, typer.Option("--id", help="the batch's id; else made of the name of SCANS")] = None,
     by_reference: Annotated[
         bool, typer.Option("--by-reference", help="send nothing: the server reads the same paths")
     ] = False,
-    preset: PresetOption = Preset.auto,
-    method: MethodOption = Method.adversarial,
-    size: SizeOption = None,
-    holdout: HoldoutOption = None,
-    steps: StepsOption = None,
     priority: PriorityOption = 0,
     keep_days: KeepOption = None,
     wait: Wait = False,
@@ -67,12 +58,11 @@ def submit(
 ) -> None:
     """Submit every scan of a folder or manifest. Run again, it goes on: no scan is sent or queued twice.
 
-    A manifest has the columns path, label, options (a JSON object), priority and keep_days; paths are relative to it,
-    or file:// and s3:// URLs that the server can read.
+    A manifest has the columns path, label, priority and keep_days, one for each option by its name (preset, size ...),
+    and options (a JSON object of them); paths are relative to it, or file:// and s3:// URLs that the server can read.
     """
     with command(as_json) as display, Client(url, api_key) as client:
-        width, height = parsed_size(size)
-        options = job_options(preset=preset, method=method, width=width, height=height, holdout=holdout, steps=steps)
+        options = job_options(given)
         run = BatchRun(
             place=scans.absolute(),
             by_reference=by_reference,

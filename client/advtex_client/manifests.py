@@ -3,6 +3,7 @@
 path       a scan's folder, zip or .sens, relative to the manifest, or its file:// or s3:// URL on the server's side
 label      the job's name; the last part of the path if it is left out
 options    a JSON object of options that differ from those of the command
+preset, method, size, steps ...  each option may have a column of its own too
 priority   larger runs earlier
 keep_days  how long the job is kept after its end
 """
@@ -16,12 +17,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from advtex_client.errors import ClientError
-from advtex_contract.options import JobOptions
+from advtex_contract.options import JobOptions, chosen_options
+from advtex_options import described
 
-COLUMNS = ("path", "label", "options", "priority", "keep_days")
+COLUMNS = ("path", "label", "options", "priority", "keep_days", *described())
 FILES = (".zip", ".r3d", ".sens")  # Record3D's files are zips
 SCHEMES = ("file://", "s3://")
 
@@ -121,15 +121,18 @@ def _item(where: str, row: Mapping[str, Any], base: Path, usual: BatchItem, by_r
     try:
         given = row.get("options", {})
         given = json.loads(given) if isinstance(given, str) else given
-        merged = JobOptions.model_validate(usual.options.model_dump() | given)
+        if not isinstance(given, dict):
+            raise TypeError(f"{given!r} is no JSON object")
+        given = given | {name: row[name] for name in described() if name in row}
         wanted = int(row.get("priority", usual.priority))
         kept = retention_seconds(float(row["keep_days"])) if "keep_days" in row else usual.retention_seconds
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise ClientError(f"{where}: options.{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
     except (ValueError, TypeError, OverflowError) as error:
         kinds = "options must be a JSON object, priority and keep_days numbers"
         raise ClientError(f"{where}: {kinds}: {error}") from error
+    try:
+        merged = chosen_options(given, usual.options)
+    except ValueError as error:
+        raise ClientError(f"{where}: {error}") from error
     item = replace(usual, label=str(label), options=merged, priority=wanted, retention_seconds=kept)
     if name.startswith(SCHEMES):
         return replace(item, source=name)

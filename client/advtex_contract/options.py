@@ -1,93 +1,112 @@
-"""User-facing knobs of a job: bounds, presets and what they cost."""
+"""The options of a job as the API takes them, made of their one description."""
 
 from __future__ import annotations
 
-from enum import StrEnum
-from typing import Self
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Self, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    create_model,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
 
+from advtex_options import SIZE, Options, described, parse_size, refusal
+from advtex_options.words import METHOD_HELP, PRESET_COST, PRESET_HELP, Method, Preset
 
-class Preset(StrEnum):
-    """How much work the optimization does. The step counts live in the engine's presets."""
-
-    auto = "auto"
-    paper = "paper"
-    full = "full"
-    standard = "standard"
-    preview = "preview"
-
-
-PRESET_HELP: dict[Preset, str] = {
-    Preset.auto: "full on a GPU, standard on a CPU",
-    Preset.paper: "the paper's method: starts from the mean of all photographs, no refined cameras, 50,000 steps",
-    Preset.full: "starts from the best photograph per face, 50,000 steps; for GPUs",
-    Preset.standard: "starts from the best photograph per face, 1,500 steps; minutes on a CPU",
-    Preset.preview: "starts from the best photograph per face, coarse to fine; about two minutes on a CPU",
-}
+__all__ = ["METHOD_HELP", "PRESET_COST", "PRESET_HELP", "JobOptions", "Method", "Preset", "chosen_options"]
 
 
-PRESET_COST: dict[Preset, str] = {
-    Preset.auto: "as full on a GPU, as standard on a CPU",
-    Preset.paper: "about 2 hours for views of 320x240 on 2 CPU cores, 8 hours for 640x480; much less on a GPU",
-    Preset.full: "about 2 hours for views of 320x240 on 2 CPU cores, 8 hours for 640x480; much less on a GPU",
-    Preset.standard: "about 3 minutes for views of 320x240 on 2 CPU cores, 5 minutes for 640x480",
-    Preset.preview: "about 2 minutes for views of 320x240 on 2 CPU cores, 4 minutes for 640x480",
-}
+class _Checked(BaseModel, frozen=True):
+    """What is checked of the options, and told in the same words as everywhere else."""
 
+    model_config = ConfigDict(extra="forbid")
 
-class Method(StrEnum):
-    """How the texture is made. All but `adversarial` are there to compare with it."""
-
-    adversarial = "adversarial"
-    adversarial_no_auxiliary = "adversarial_no_auxiliary"
-    adversarial_no_condition = "adversarial_no_condition"
-    best_view = "best_view"
-    colormap = "colormap"
-    l1 = "l1"
-    mean = "mean"
-    sharpest = "sharpest"
-    vgg = "vgg"
-    view_selection = "view_selection"
-
-
-METHOD_HELP: dict[Method, str] = {
-    Method.adversarial: "the texture is optimized against a patch discriminator",
-    Method.adversarial_no_auxiliary: "the same without auxiliary views: what they are worth",
-    Method.adversarial_no_condition: "the same without showing the discriminator the source view",
-    Method.best_view: "each face from the view that shows it largest",
-    Method.colormap: "refined cameras and smoothly corrected photographs, then the mean",
-    Method.l1: "least absolute difference to all views",
-    Method.mean: "the mean of all views",
-    Method.sharpest: "each face from the sharpest view that sees it",
-    Method.vgg: "least difference in the features of VGG16, whose weights the worker must have",
-    Method.view_selection: "one view per face with few seams, leveled; in about a minute",
-}
-
-
-class JobOptions(BaseModel):
-    """What a user may set. Everything has a default that suits most scans."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    preset: Preset = Preset.auto
-    method: Method = Method.adversarial
-    width: int | None = Field(default=None, ge=64, le=4096, description="working width of the views, pixels")
-    height: int | None = Field(default=None, ge=64, le=4096, description="working height of the views, pixels")
-    steps: int | None = Field(default=None, ge=1, le=1_000_000, description="overrides the preset's step count")
-    face_budget: int | None = Field(default=None, ge=100, le=2_000_000, description="decimate the mesh to this")
-    max_views: int | None = Field(default=None, ge=2, le=2000, description="choose these many frames of a longer scan")
-    max_texture_size: int = Field(default=4096, ge=256, le=16384, description="cap on the texture's side, texels")
-    holdout: int | None = Field(
-        default=None, ge=2, le=1000, description="leave out every Nth sorted frame (position % N == N // 2)"
-    )
-    seed: int = Field(default=0, ge=0, le=2**31 - 1)
-    layout: str | None = Field(
-        default=None, max_length=40, description="read the files as this layout; otherwise as the one that fits best"
-    )
+    @field_validator("*", mode="wrap")
+    @classmethod
+    def _refused_in_words(cls, value: object, check: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
+        try:
+            return check(value)
+        except ValidationError as error:
+            assert info.field_name is not None
+            if (words := refusal(info.field_name, value)) is None:
+                raise
+            raise PydanticCustomError(error.errors()[0]["type"], "{words}", {"words": words}) from error
 
     @model_validator(mode="after")
     def _size_is_whole(self) -> Self:
-        if (self.width is None) != (self.height is None):
+        if (getattr(self, "width") is None) != (getattr(self, "height") is None):  # noqa: B009
             raise ValueError("width and height go together: give both or neither")
         return self
+
+
+def _described_fields() -> dict[str, Any]:
+    """Types and fields by name, as `create_model` takes them, `size` in two.
+
+    Their order is kept: what a client remembers of a submission is found by the options' JSON.
+    """
+    made: dict[str, Any] = {}
+    types = get_type_hints(Options)
+    for name, about in described().items():
+        if name == "size":
+            words = f"{SIZE.help}; left out: {SIZE.unset}"
+            side = (int | None, Field(default=None, description=words, ge=SIZE.low, le=SIZE.high))
+            made |= {"width": side, "height": side}
+            continue
+        kind, default = _NARROWER.get(name, types[name]), getattr(Options, name)
+        if name in _NARROWER:
+            default = kind(default)
+        words = about.help if default is not None else f"{about.help}; left out: {about.unset}"
+        longest = 40 if kind in (str, str | None) else None
+        field = Field(default=default, description=words, ge=about.low, le=about.high, max_length=longest)
+        made[name] = (kind, field)
+    return made
+
+
+_NARROWER: Mapping[str, Any] = {"preset": Preset, "method": Method}
+
+if TYPE_CHECKING:
+
+    class JobOptions(_Checked, Options, frozen=True):
+        preset: Preset = Preset.auto
+        method: Method = Method.adversarial
+        width: int | None = None
+        height: int | None = None
+else:
+    JobOptions = create_model(
+        "JobOptions", __base__=_Checked, __module__=__name__, __doc__=Options.__doc__, **_described_fields()
+    )
+
+
+def chosen_options(given: Mapping[str, Any], usual: JobOptions | None = None) -> JobOptions:
+    """`usual` with what was given instead, as flags and columns have it: by name, `size` in one word.
+
+    Raises ValueError, in a sentence, for what cannot be used.
+    """
+    given = dict(given)
+    if (size := given.pop("size", None)) is not None:
+        sides = parse_size(str(size))
+        if (words := refusal("size", sides)) is not None:
+            raise ValueError(words)
+        given["width"], given["height"] = sides
+    for name in given.keys() & _OPEN:
+        if given[name] is not None and (words := refusal(name, given[name])) is not None:
+            raise ValueError(words)
+    try:
+        return JobOptions.model_validate((usual or JobOptions()).model_dump() | given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(map(str, first["loc"]))
+        told = first["msg"].removeprefix("Value error, ")
+        raise ValueError(told if name in told else f"options.{name}: {told}") from error
+
+
+_OPEN = {"layout"}
+"""Options whose words another version may have more of: not checked where jobs are read."""

@@ -8,6 +8,7 @@ is never less. On GPUs the base covers CUDA's own context.
 from __future__ import annotations
 
 from advtex_contract.options import JobOptions, Preset
+from advtex_options.options import MAX_VIEWS
 
 GIB = 1 << 30
 BASE = GIB  # libraries, mesh, discriminator
@@ -19,8 +20,7 @@ PER_TEXEL = 200
 PER_STEP_PIXEL = 2048  # activations of the discriminator and what is rendered
 PER_SCORED_PIXEL = 4096  # LPIPS of held-out views
 STANDARD_STEP_PIXELS = 384 * 288  # that preset sees larger views in parts
-MAX_VIEWS = 240  # the engine chooses so many of a longer scan when it is not told how many, and fewer
-MAX_VIEW_BYTES = 8 * GIB  # where theirs would be more
+MAX_VIEW_BYTES = 8 * GIB  # the engine chooses fewer views where theirs would be more
 MAX_SCORED_VIEWS = 50  # kept beside them
 # Of a mesh that is fused from depth, before it is decimated: 62 frames of a kitchen took 0.95 GiB. The engine caps its
 # voxels, and with them its faces.

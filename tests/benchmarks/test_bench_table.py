@@ -11,8 +11,9 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from typer.main import get_command
 
-from advtex_engine.__main__ import _parser
+from advtex_engine.__main__ import app
 
 PATH = Path(__file__).with_name("bench.py")
 
@@ -95,9 +96,10 @@ def test_rows_are_added_and_gpu_rows_stay_empty_until_measured(
 def test_the_bench_is_run_as_anyone_would_and_its_line_kept(table: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     def process(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
         assert command[:4] == [sys.executable, "-m", "advtex_engine", "bench"]
-        options = vars(_parser().parse_args(command[3:]))
+        bench = get_command(app).commands["bench"]  # type: ignore[attr-defined]
+        options = bench.make_context("bench", list(command[4:])).params
         assert (options["width"], options["height"], options["views"], options["faces"]) == (64, 48, 8, 300)
-        assert (options["device"], options["preset"], options["json"]) == ("cpu", "full", True)
+        assert (options["device"], options["preset"], options["as_json"]) == ("cpu", "full", True)
         return subprocess.CompletedProcess(command, 0, json.dumps(result("cpu", 0.5)))
 
     monkeypatch.setattr(table.subprocess, "run", process)

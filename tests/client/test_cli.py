@@ -138,8 +138,8 @@ def test_how_long_a_job_is_kept_is_asked_and_shown(server: FakeServer, scan: Pat
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--size", "big"], "give it as WxH"),
-        (["--size", "10x10"], "width"),
+        (["--size", "big"], "give it as WIDTHxHEIGHT"),
+        (["--size", "10x10"], "64 to 4096"),
         (["--steps", "0"], "steps"),
         (["--max-texture-size", "100000"], "max_texture_size"),
         (["--face-budget", "1"], "face_budget"),

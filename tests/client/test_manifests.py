@@ -73,9 +73,10 @@ def test_json_lines(scenes: Path) -> None:
     ("name", "text", "message"),
     [
         ("a.csv", "path\nx\nx\n", "line 3 is the same as a.csv line 2"),
-        ("a.csv", "path,steps\nx,3\n", "line 2: there is no column 'steps'"),
+        ("a.csv", "path,stpes\nx,3\n", "line 2: there is no column 'stpes'"),
+        ("a.csv", "path,size\nx,8x8\n", "line 2: size 8x8 is out of bounds"),
         ("a.csv", "label\nx\n", "line 2: the path is missing"),
-        ("a.csv", 'path,options\nx,"{""steps"": 0}"\n', "line 2: options.steps"),
+        ("a.csv", 'path,options\nx,"{""steps"": 0}"\n', "line 2: steps 0 is out of bounds; give 1 to 1000000"),
         ("a.csv", "path,options\nx,fast\n", "line 2: options must be a JSON object"),
         ("a.csv", "path,options\nx,3\n", "line 2: options must be a JSON object"),
         ("a.csv", "path,priority\nx,high\n", "priority and keep_days numbers"),

@@ -17,7 +17,7 @@ MODELS = sorted(
         model
         for module in (errors, health, jobs, live, options, webhooks)
         for _, model in inspect.getmembers(module, inspect.isclass)
-        if issubclass(model, BaseModel) and model.__module__ == module.__name__
+        if issubclass(model, BaseModel) and model.__module__ == module.__name__ and not model.__name__.startswith("_")
     },
     key=lambda model: model.__name__,
 )

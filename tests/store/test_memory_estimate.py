@@ -8,16 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from advtex_contract.options import JobOptions, Preset
-from advtex_engine.core.config import TextureConfig
 from advtex_engine.ingest.frames import MAX_HELDOUT, MAX_MAP_BYTES
 from advtex_engine.mesh.fusion import MAX_VOXEL_BYTES
+from advtex_options.options import MAX_VIEWS
 from advtex_store.memory_estimate import (
     BASE,
     GIB,
     MAX_FUSED,
     MAX_SCORED_VIEWS,
     MAX_VIEW_BYTES,
-    MAX_VIEWS,
     PER_FUSED_FRAME,
     needed_memory,
 )
@@ -60,7 +59,6 @@ def test_scores_take_room() -> None:
 
 
 def test_of_long_scans_only_chosen_views_count() -> None:
-    assert TextureConfig().max_views == MAX_VIEWS
     assert MAX_HELDOUT == MAX_SCORED_VIEWS
     assert MAX_MAP_BYTES == MAX_VIEW_BYTES
     assert needed_memory(JobOptions(), 100_000, 640, 480) == needed_memory(JobOptions(), MAX_VIEWS, 640, 480)

@@ -21,10 +21,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from advtex_contract.jobs import Progress
-from advtex_contract.options import JobOptions, Method, Preset
+from advtex_contract.options import JobOptions, Method, Preset, chosen_options
 from advtex_contract.stages import STAGE_LABELS
 from advtex_engine.core import config as engine
+from advtex_engine.core.errors import OptionError
 from advtex_engine.core.monitor import STAGES
+from advtex_engine.methods import METHODS
+from advtex_options import described
 from advtex_store.errors import StaleAttempt
 from advtex_store.queue import TASK
 from advtex_store.records import Lease
@@ -67,26 +70,22 @@ def test_presets_of_users_and_engine_are_the_same() -> None:
 
 
 def test_methods_of_users_and_engine_are_the_same() -> None:
-    assert {method.value for method in Method} == set(engine.METHODS)
+    assert {method.value for method in Method} == set(METHODS)
 
 
-BOUNDS = {
-    "width": 64,
-    "height": 64,
-    "steps": 1,
-    "face_budget": 100,
-    "max_texture_size": 256,
-    "holdout": 2,
-    "max_views": 2,
-}
-
-
-@pytest.mark.parametrize("name", sorted(BOUNDS))
-def test_the_engine_takes_what_the_contract_takes_at_its_bounds(name: str) -> None:
-    both = {"width": 100, "height": 100} if name in ("width", "height") else {}
-    for bound in JobOptions.model_fields[name].metadata:
-        value = getattr(bound, "ge", None) or getattr(bound, "le", None)
-        texture_config(JobOptions.model_validate(both | {name: value}), "cpu")
+@pytest.mark.parametrize("name", [name for name, about in described().items() if about.low is not None])
+def test_engine_and_contract_refuse_in_the_same_words(name: str) -> None:
+    about = described()[name]
+    assert about.low is not None
+    assert about.high is not None
+    for bound, beyond in ((about.low, about.low - 1), (about.high, about.high + 1)):
+        right, wrong = (f"{bound}x{bound}", f"{beyond}x{beyond}") if name == "size" else (bound, beyond)
+        texture_config(chosen_options({name: right}), "cpu")
+        with pytest.raises(ValueError, match=f"{name} .* is out of bounds; give ") as told:
+            chosen_options({name: wrong})
+        with pytest.raises(OptionError) as refused:
+            engine.TextureConfig(**{name: (beyond, beyond) if name == "size" else beyond})  # type: ignore[arg-type]
+        assert str(refused.value) == str(told.value)
 
 
 @given(

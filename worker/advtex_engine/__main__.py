@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-import argparse
-import dataclasses
 import json
 import signal
 import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Annotated, Any
 
-from advtex_engine.bench.options import add_bench_options
-from advtex_engine.core.config import METHODS, PRESETS, TextureConfig
+import typer
+
+from advtex_engine.bench.options import DEVICE, FACES, HEIGHT, PRESET, VIEWS, WIDTH
+from advtex_engine.core.config import PRESETS, TextureConfig
 from advtex_engine.core.errors import EngineError, OptionError, Problem, Stopped
 from advtex_engine.core.monitor import Monitor
-from advtex_scan.layouts import LAYOUT_NAMES
+from advtex_options import parse_size
+from advtex_options.flags import LayoutFlag, option_flags
 from advtex_scan.version import product_version
 
 
@@ -69,76 +71,40 @@ class _Terminal(_Printer):
         return self.stop
 
 
-def parse_size(text: str) -> tuple[int, int]:
-    """ "320x240" -> (320, 240)."""
-    width, _, height = text.lower().partition("x")
-    if not (width.isdigit() and height.isdigit()):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a size; write WIDTHxHEIGHT, for example 320x240")
-    return int(width), int(height)
+app = typer.Typer(
+    help="The engine alone, without a service.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+ScanPath = Annotated[Path, typer.Argument(help="folder or zip")]
+HOLDOUT = "only the sorted frames whose position % N == N // 2"
+SIZE = "size of renders and photographs"
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="advtex-engine", description=__doc__)
-    parser.add_argument("--version", action="version", version=f"advtex-engine {product_version()}")
-    commands = parser.add_subparsers(dest="command", required=True)
-    texture = commands.add_parser("texture", help="texture a scan (folder or zip)")
-    texture.add_argument("scan", type=Path)
-    texture.add_argument("-o", "--out", type=Path, required=True, help="folder for the result")
-    texture.add_argument("--preset", default="auto", choices=("auto", *PRESETS))
-    texture.add_argument("--method", default="adversarial", choices=METHODS)
-    texture.add_argument("--size", type=parse_size, help="working size of the views, WIDTHxHEIGHT")
-    texture.add_argument("--holdout", type=int, help="leave out the sorted frames whose position %% N == N // 2")
-    texture.add_argument("--steps", type=int, help="override the preset's step count")
-    texture.add_argument(
-        "--refine",
-        action=argparse.BooleanOptionalAction,
-        default=TextureConfig.refine,
-        help="refine cameras and exposures first; the preset paper never does, the method colormap always",
-    )
-    texture.add_argument("--face-budget", type=int, default=TextureConfig.face_budget)
-    texture.add_argument("--max-views", type=int, default=TextureConfig.max_views, help="chosen from a longer scan")
-    texture.add_argument("--max-texture-size", type=int, default=TextureConfig.max_texture_size)
-    texture.add_argument("--layout", choices=LAYOUT_NAMES, help="how the files are laid out; else found out")
-    texture.add_argument("--device", default="auto")
-    texture.add_argument("--seed", type=int, default=0)
-    texture.add_argument("--checkpoint-seconds", type=float, default=TextureConfig.checkpoint_seconds)
-    texture.add_argument("--resume", action="store_true", help="go on from the checkpoint in OUT/work")
-    check = commands.add_parser("check", help="measure whether a scan means what its layout says")
-    check.add_argument("scan", type=Path, help="folder or zip")
-    check.add_argument("--layout", choices=LAYOUT_NAMES, help="how the files are laid out; else found out")
-    check.add_argument("--json", action="store_true", help="one line of JSON")
-    evaluate = commands.add_parser("evaluate", help="score a textured model against a scan's photographs")
-    evaluate.add_argument("model", type=Path, help="OBJ or GLB with one texture")
-    evaluate.add_argument("scan", type=Path, help="folder or zip")
-    evaluate.add_argument("--holdout", type=int, help="only the sorted frames whose position %% N == N // 2")
-    evaluate.add_argument("--size", type=parse_size, help="size of renders and photographs, WIDTHxHEIGHT")
-    evaluate.add_argument("--layout", choices=LAYOUT_NAMES, help="how the scan's files are laid out; else found out")
-    evaluate.add_argument("--reference", type=Path, help="mesh that decides which pixels count; default: the scan's")
-    evaluate.add_argument("--lpips-weights", type=Path, help="folder; default: $ADVTEX_LPIPS_WEIGHTS, else the cache")
-    evaluate.add_argument("--download-weights", action="store_true", help="fetch the weights of LPIPS if they lack")
-    evaluate.add_argument(
-        "--refine-heldout", action="store_true", help="refine the frames' poses against the model first, and say so"
-    )
-    evaluate.add_argument("--json", type=Path, help="write the scores per view and their means")
-    evaluate.add_argument("--contact-sheet", type=Path, help="write a PNG: photograph, render, difference")
-    synthesize = commands.add_parser("synthesize", help="make a scan with known truth")
-    synthesize.add_argument("out", type=Path, help="folder, or file.zip")
-    synthesize.add_argument("--views", type=int, default=60)
-    synthesize.add_argument("--size", type=parse_size, default=(320, 240))
-    synthesize.add_argument("--seed", type=int, default=0)
-    compare = commands.add_parser("compare", help="score a result against the truth of a synthesized scan")
-    compare.add_argument("model", type=Path, help="model.obj")
-    compare.add_argument("scan", type=Path, help="the synthesized scan")
-    bench = commands.add_parser("bench", help="time a step of the optimization, its parts and the stages around it")
-    add_bench_options(bench)
-    return parser
+def _print_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"advtex-engine {product_version()}")
+        raise typer.Exit
+
+
+@app.callback()
+def advtex_engine(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and exit")
+    ] = False,
+) -> None:
+    """The engine alone, without a service."""
 
 
 def main(argv: list[str] | None = None) -> int:
     """Runs a command; exit codes: 0 done, 1 the input cannot be used, 2 usage, 130 stopped with a checkpoint."""
-    arguments = _parser().parse_args(argv)
     try:
-        return _COMMANDS[arguments.command](arguments)
+        app(argv, prog_name="advtex-engine")
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else 1
     except Stopped as stopped:
         print(f"advtex-engine: {stopped}", file=sys.stderr)
         return 130
@@ -148,47 +114,93 @@ def main(argv: list[str] | None = None) -> int:
     except EngineError as error:
         print(f"advtex-engine: {error}", file=sys.stderr)
         return 1
-
-
-def _texture(arguments: argparse.Namespace) -> int:
-    from advtex_engine.pipeline import texture_scan
-
-    names = {option.name for option in dataclasses.fields(TextureConfig)} & vars(arguments).keys()
-    config = TextureConfig(**{name: getattr(arguments, name) for name in names})
-    out: Path = arguments.out
-    result = texture_scan(arguments.scan, out, config, work=out / "work", resume=arguments.resume, monitor=_Terminal())
-    for path in result.files:
-        print(path)
     return 0
 
 
-def _check(arguments: argparse.Namespace) -> int:
+@app.command()
+@option_flags
+def texture(
+    scan: ScanPath,
+    out: Annotated[Path, typer.Option("-o", "--out", help="folder for the result")],
+    given: dict[str, Any],
+    refine: Annotated[
+        bool, typer.Option(help="refine cameras and exposures first; the preset paper never does, some methods always")
+    ] = TextureConfig.refine,
+    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:N, or auto")] = TextureConfig.device,
+    checkpoint_seconds: Annotated[
+        float, typer.Option(help="time between checkpoints")
+    ] = TextureConfig.checkpoint_seconds,
+    resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in OUT/work")] = False,
+) -> None:
+    """Texture a scan (folder or zip)."""
+    from advtex_engine.pipeline import texture_scan
+
+    given["size"] = _pair(given.get("size"))
+    config = TextureConfig(**given, refine=refine, device=device, checkpoint_seconds=checkpoint_seconds)
+    result = texture_scan(scan, out, config, work=out / "work", resume=resume, monitor=_Terminal())
+    for path in result.files:
+        print(path)
+
+
+@app.command()
+def check(
+    scan: ScanPath,
+    layout: LayoutFlag = None,
+    as_json: Annotated[bool, typer.Option("--json", help="one line of JSON")] = False,
+) -> None:
+    """Measure whether a scan means what its layout says."""
     from advtex_engine.conventions.check import deep_check
 
-    check = deep_check(arguments.scan, arguments.layout)
-    if arguments.json:
-        print(json.dumps(None if check is None else check.to_dict()))
+    found = deep_check(scan, layout)
+    if as_json:
+        print(json.dumps(None if found is None else found.to_dict()))
     else:
-        print("nothing can be measured: there is neither depth nor a mesh" if check is None else check.format_text())
-    return 1 if check is not None and check.hopeless else 0
+        print("nothing can be measured: there is neither depth nor a mesh" if found is None else found.format_text())
+    if found is not None and found.hopeless:
+        raise typer.Exit(1)
 
 
-def _evaluate(arguments: argparse.Namespace) -> int:
+@app.command()
+def evaluate(
+    model: Annotated[Path, typer.Argument(help="OBJ or GLB with one texture")],
+    scan: ScanPath,
+    holdout: Annotated[int | None, typer.Option(help=HOLDOUT)] = None,
+    size: Annotated[str | None, typer.Option(metavar="WxH", help=SIZE)] = None,
+    layout: LayoutFlag = None,
+    reference: Annotated[
+        Path | None, typer.Option(help="mesh that decides which pixels count", show_default="the scan's")
+    ] = None,
+    lpips_weights: Annotated[
+        Path | None, typer.Option(help="folder", show_default="$ADVTEX_LPIPS_WEIGHTS, else the cache")
+    ] = None,
+    download_weights: Annotated[
+        bool, typer.Option("--download-weights", help="fetch the weights of LPIPS if they lack")
+    ] = False,
+    refine_heldout: Annotated[
+        bool, typer.Option("--refine-heldout", help="refine the frames' poses against the model first, and say so")
+    ] = False,
+    json_: Annotated[Path | None, typer.Option("--json", help="write the scores per view and their means")] = None,
+    contact_sheet: Annotated[Path | None, typer.Option(help="write a PNG: photograph, render, difference")] = None,
+) -> None:
+    """Score a textured model against a scan's photographs."""
     from advtex_engine.metrics.evaluate import evaluate, write_json
     from advtex_engine.metrics.lpips import LPIPS_SOURCES, download, weights_folder
 
-    if arguments.download_weights:
-        download(LPIPS_SOURCES, weights_folder(arguments.lpips_weights))
-    given = {name: getattr(arguments, name) for name in ("model", "scan", "size", "holdout", "layout", "reference")}
+    given: dict[str, Any] = {
+        "model": model,
+        "scan": scan,
+        "size": _pair(size),
+        "holdout": holdout,
+        "layout": layout,
+        "reference": reference,
+    }
+    if download_weights:
+        download(LPIPS_SOURCES, weights_folder(lpips_weights))
     evaluation = evaluate(
-        **given,
-        weights=arguments.lpips_weights,
-        sheet=arguments.contact_sheet,
-        refine_poses=arguments.refine_heldout,
-        monitor=_Printer(),
+        **given, weights=lpips_weights, sheet=contact_sheet, refine_poses=refine_heldout, monitor=_Printer()
     )
-    if arguments.json is not None:
-        write_json(arguments.json, evaluation, given)
+    if json_ is not None:
+        write_json(json_, evaluation, given)
     for name, value in evaluation.mean.items():
         print(f"{name:24}{'-' if value is None else format(value, '.4g')}")
     if evaluation.refined is not None:
@@ -198,39 +210,64 @@ def _evaluate(arguments: argparse.Namespace) -> int:
             print(f"  {row['name']} {words}")
     for name, reason in evaluation.missing.items():
         print(f"{name} is missing: {reason}", file=sys.stderr)
-    return 0
 
 
-def _synthesize(arguments: argparse.Namespace) -> int:
+@app.command()
+def synthesize(
+    out: Annotated[Path, typer.Argument(help="folder, or file.zip")],
+    views: int = 60,
+    size: Annotated[str, typer.Option(metavar="WxH", help="of the views, pixels")] = "320x240",
+    seed: int = 0,
+) -> None:
+    """Make a scan with known truth."""
     from advtex_engine.synthetic.scan import synthesize
 
-    width, height = arguments.size
-    synthesize(arguments.out, views=arguments.views, width=width, height=height, seed=arguments.seed)
-    print(arguments.out)
-    return 0
+    width, height = _pair(size) or (320, 240)
+    synthesize(out, views=views, width=width, height=height, seed=seed)
+    print(out)
 
 
-def _compare(arguments: argparse.Namespace) -> int:
+@app.command()
+def compare(
+    model: Annotated[Path, typer.Argument(help="model.obj")],
+    scan: Annotated[Path, typer.Argument(help="the synthesized scan")],
+) -> None:
+    """Score a result against the truth of a synthesized scan."""
     from advtex_engine.synthetic.scan import compare_to_truth
 
-    print(json.dumps(compare_to_truth(arguments.model, arguments.scan)))
-    return 0
+    print(json.dumps(compare_to_truth(model, scan)))
 
 
-def _bench(arguments: argparse.Namespace) -> int:
-    from advtex_engine.bench.run import run
+@app.command()
+def bench(
+    device: str = DEVICE,
+    width: Annotated[int, typer.Option(help="of the full frame in pixels; a step sees a crop of it")] = WIDTH,
+    height: Annotated[int, typer.Option(help="of the full frame in pixels")] = HEIGHT,
+    preset: Annotated[
+        str, typer.Option(metavar="|".join(PRESETS), help="decides the crop's size and the losses")
+    ] = PRESET,
+    views: Annotated[int, typer.Option(help="of the scene that is made")] = VIEWS,
+    faces: Annotated[int, typer.Option(help="of the scene that is made, about")] = FACES,
+    as_json: Annotated[bool, typer.Option("--json", help="one line of JSON")] = False,
+) -> None:
+    """Time a step of the optimization, its parts and the stages around it."""
+    if preset not in PRESETS:
+        raise OptionError(f"preset {preset!r} is unknown; choose one of {', '.join(PRESETS)}")
+    from advtex_engine.bench.run import bench, print_table
 
-    return run(arguments)
+    result = bench(device, width, height, preset, views=views, faces=faces)
+    if as_json:
+        print(json.dumps(result))
+    else:
+        print_table(result)
 
 
-_COMMANDS = {
-    "texture": _texture,
-    "check": _check,
-    "evaluate": _evaluate,
-    "synthesize": _synthesize,
-    "compare": _compare,
-    "bench": _bench,
-}
+def _pair(size: str | None) -> tuple[int, int] | None:
+    """Width and height of a flag; OptionError."""
+    try:
+        return None if size is None else parse_size(size)
+    except ValueError as error:
+        raise OptionError(str(error)) from error
 
 
 if __name__ == "__main__":

@@ -17,9 +17,10 @@ from starlette.concurrency import run_in_threadpool
 
 from advtex_contract.errors import ErrorCode
 from advtex_contract.jobs import RETRYABLE, STATES, JobState, Label
-from advtex_contract.options import METHOD_HELP, PRESET_COST, PRESET_HELP, JobOptions, Preset
+from advtex_contract.options import PRESET_COST, PRESET_HELP, Preset
 from advtex_contract.stages import STAGE_LABELS
-from advtex_scan.layouts import LAYOUT_NAMES
+from advtex_options import Options, described
+from advtex_options.options import kind_of
 from advtex_server import static_files
 from advtex_server.authentication import Authenticator
 from advtex_server.browsers import BrowserSessions, check_same_origin, cookie_name
@@ -54,7 +55,11 @@ _WORDS = {
     "stages": STAGE_LABELS,
 }
 _PRESETS = (Preset.auto, Preset.preview, Preset.standard, Preset.full, Preset.paper)  # by their cost
-_OPTIONS = JobOptions.model_json_schema()["properties"]
+_OPTIONS = [
+    {"name": name, "about": about, "kind": kind_of(name).__name__, "default": getattr(Options, name, None)}
+    for name, about in described().items()
+    if name != "preset"  # shown by itself, with what each costs
+]
 
 templates = jinja2.Environment(
     loader=jinja2.FileSystemLoader(Path(__file__).parents[1] / "templates"),
@@ -124,8 +129,7 @@ async def submit_page(request: Request, service: TheService) -> Response:
     caller = await _reader(request)
     data = {"max_upload_bytes": service.settings.max_upload_bytes}
     presets = [(preset, PRESET_HELP[preset], PRESET_COST[preset]) for preset in _PRESETS]
-    layouts = LAYOUT_NAMES
-    return _page("new.html", caller, data=data, presets=presets, methods=METHOD_HELP, layouts=layouts, bounds=_OPTIONS)
+    return _page("new.html", caller, data=data, presets=presets, options=_OPTIONS)
 
 
 @router.get("/jobs/{job_id}")

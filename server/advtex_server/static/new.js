@@ -134,14 +134,17 @@ function told(error) {
   return new CallError(answer.getStatus(), body);
 }
 
+/** "320x240" -> [320, 240] */
+const parseSize = (text) => text.split("x").map(Number);
+
 function spec(uploadId) {
   const given = Object.fromEntries(new FormData(form));
-  const options = { preset: given.preset, method: given.method, max_texture_size: Number(given.max_texture_size) };
-  for (const name of ["steps", "max_views", "face_budget", "seed", "holdout"]) {
-    if (given[name]) options[name] = Number(given[name]);
+  const options = { preset: given.preset };
+  for (const { name, value, dataset } of form.querySelectorAll("[data-option]")) {
+    if (value === "") continue;
+    if (name === "size") [options.width, options.height] = parseSize(value);
+    else options[name] = dataset.option === "str" ? value : Number(value);
   }
-  if (given.layout) options.layout = given.layout;
-  if (given.size) [options.width, options.height] = given.size.split("x").map(Number);
   return { upload_id: uploadId, options, label: given.label, ...(given.batch && { batch: given.batch }) };
 }
 

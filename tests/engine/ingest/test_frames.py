@@ -168,6 +168,6 @@ def test_the_budget_is_in_views_and_in_bytes() -> None:
     assert view_budget(300, 640, 480) == view_budget(300, 1296, 968) == 300
     assert view_budget(1000, 1296, 968) == 760
     assert view_budget(300, 4000, 3000) == 79
-    with pytest.raises(OptionError, match="max views 1 is out of bounds"):
+    with pytest.raises(OptionError, match="max_views 1 is out of bounds; give 2 to 2000 frames"):
         TextureConfig(max_views=1)
     assert MAX_HELDOUT < 100

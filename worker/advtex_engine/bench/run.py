@@ -1,17 +1,15 @@
 """Times a step of the optimization with its parts, and the stages around it, beside what the device could do at best.
 
-    advtex-engine bench --json          python -m advtex_engine.bench.run --json
+    advtex-engine bench --json
 
-The scene is made here (`bench_scene`), so that only torch and numpy are needed: this package on the PYTHONPATH of a
-bare GPU machine is enough. The floor of a part is the time of its bytes at the speed of a large copy and of its
-operations at that of a large matrix product, both measured on the device in the same run. On a CPU, what fits into a
-core's cache may be faster than its floor.
+The scene is made here (`bench_scene`), so that only torch and numpy are needed: on a bare GPU machine, the folders
+`worker` and `client` on the PYTHONPATH are enough to call `bench`. The floor of a part is the time of its bytes at the
+speed of a large copy and of its operations at that of a large matrix product, both measured on the device in the same
+run. On a CPU, what fits into a core's cache may be faster than its floor.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import time
 from collections import defaultdict
@@ -28,7 +26,7 @@ from advtex_engine.adversarial.optimizer import AdversarialOptimizer, Losses
 from advtex_engine.adversarial.pair_sampler import DrawnPair
 from advtex_engine.bench.counts import Work, step_flops, step_parts
 from advtex_engine.bench.limits import Limits, measure_limits
-from advtex_engine.bench.options import FACES, VIEWS, add_bench_options
+from advtex_engine.bench.options import FACES, VIEWS
 from advtex_engine.bench.profile import profile_steps
 from advtex_engine.bench.scene import made_scene
 from advtex_engine.bench.stages import Stage, time_stages
@@ -241,31 +239,3 @@ def _begun(kind: type[AdversarialOptimizer], maps: ViewMaps, pairs: Pairs, prese
     )
     optimizer.index = preset.pretraining
     return optimizer
-
-
-def run(arguments: argparse.Namespace) -> int:
-    """The command."""
-    result = bench(
-        arguments.device,
-        arguments.width,
-        arguments.height,
-        arguments.preset,
-        views=arguments.views,
-        faces=arguments.faces,
-    )
-    if arguments.json:
-        print(json.dumps(result))
-    else:
-        print_table(result)
-    return 0
-
-
-def main() -> int:
-    """`python -m advtex_engine.bench.run`: the command where nothing but this package, torch and numpy is installed."""
-    parser = argparse.ArgumentParser(prog="advtex_engine.bench.run", description=__doc__)
-    add_bench_options(parser)
-    return run(parser.parse_args())
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from advtex_engine.core.errors import OptionError
+from advtex_options import Options, described, refusal
+from advtex_options.options import FACE_BUDGET, MAX_VIEWS
 
 
 @dataclass(frozen=True)
@@ -150,50 +152,26 @@ PRESETS: dict[str, Preset] = {
         STANDARD, levels=(PyramidLevel(800, scale=2), PyramidLevel(300)), pretraining=120, averaging=100
     ),
 }
-METHODS = (
-    "adversarial",
-    "adversarial_no_auxiliary",
-    "adversarial_no_condition",
-    "best_view",
-    "colormap",
-    "l1",
-    "mean",
-    "sharpest",
-    "vgg",
-    "view_selection",
-)
 
 
 @dataclass(frozen=True)
-class TextureConfig:
-    """What one run is asked to do.
+class TextureConfig(Options):
+    """What one run is asked to do: the user's options, and what is the machine's or the engine's own.
 
     preset            a name of PRESETS, or "auto": full on a GPU, standard on a CPU
     size              working size (width, height) of the views in pixels; None keeps the scan's
-    holdout           N leaves out of every stage the sorted frames whose position % N == N // 2
-    steps             overrides the preset's step count, its levels scaled in proportion
-    face_budget       the mesh is decimated to at most this many faces
     max_views         of a longer scan, these many frames are chosen; fewer where their maps would not fit into memory
-    max_texture_size  cap on the texture's side in texels
-    layout            name of the scan's layout; None takes the one that fits best
     memory_bytes      what the run may take of a GPU that others use too; None: all that is free
     refine            cameras and exposures are refined first; never for the preset "paper", which has no such stage
     """
 
-    preset: str = "auto"
-    method: str = "adversarial"
+    face_budget: int = FACE_BUDGET
+    max_views: int = MAX_VIEWS
     size: tuple[int, int] | None = None
-    holdout: int | None = None
-    steps: int | None = None
-    face_budget: int = 80_000
-    max_views: int = 240
-    max_texture_size: int = 4096
     texels_per_pixel: float = 1.2
     refine: bool = True
     device: str = "auto"
-    seed: int = 0
     checkpoint_seconds: float = 30.0
-    layout: str | None = None
     memory_bytes: int | None = None
 
     @property
@@ -202,22 +180,10 @@ class TextureConfig:
         return self.method == "colormap" or (self.refine and self.preset != "paper")
 
     def __post_init__(self) -> None:
-        if self.preset != "auto" and self.preset not in PRESETS:
-            raise OptionError(f"preset {self.preset!r} is unknown; choose one of auto, {', '.join(PRESETS)}")
-        if self.method not in METHODS:
-            raise OptionError(f"method {self.method!r} is unknown; choose one of {', '.join(METHODS)}")
-        if self.size is not None and not all(64 <= side <= 4096 for side in self.size):
-            raise OptionError(f"size {self.size[0]}x{self.size[1]} is out of bounds; each side takes 64 to 4096 pixels")
-        if self.holdout is not None and self.holdout < 2:
-            raise OptionError(f"holdout {self.holdout} is out of bounds; 2 or more leaves every Nth frame out")
-        if self.steps is not None and self.steps < 1:
-            raise OptionError(f"steps {self.steps} is out of bounds; at least 1 is needed")
-        if self.face_budget < 100:
-            raise OptionError(f"face budget {self.face_budget} is out of bounds; at least 100 faces are needed")
-        if self.max_views < 2:
-            raise OptionError(f"max views {self.max_views} is out of bounds; at least 2 are compared with each other")
-        if not 256 <= self.max_texture_size <= 16384:
-            raise OptionError(f"max texture size {self.max_texture_size} is out of bounds; 256 to 16384 texels fit")
+        for name in described():
+            value = getattr(self, name)
+            if value is not None and (words := refusal(name, value)) is not None:
+                raise OptionError(words)
 
 
 def resolve_preset(config: TextureConfig, device_type: str) -> Preset:

@@ -81,7 +81,7 @@ def retention(keep_days: float | None) -> int | None:
 
 
 def job_options(given: Mapping[str, object]) -> JobOptions:
-    """Return the options of the flags that were given. Raises ClientError for one that cannot be used."""
+    """Return the options, those that were not given at their defaults. Raises ClientError for one out of bounds."""
     try:
         return chosen_options(given)
     except ValueError as error:

@@ -103,23 +103,25 @@ class AsyncClient:
         options: JobOptions | None = None,
         *,
         label: str = "",
+        batch: str | None = None,
         priority: int = 0,
         retention_seconds: int | None = None,
         new: bool = False,
         on_bytes: OnBytes | None = None,
     ) -> JobView:
-        """Check, pack and send a scan; the same scan with the same options and label gives the same job again.
+        """Check, pack and send a scan; the same scan, options, label and batch give the same job again.
 
         The server checks it once more before it queues the job: `watch_job` and `wait_for_job` tell what came of it.
 
         Raises ScanRejectedError, with every problem found, before anything is sent. `new` makes another job.
         `retention_seconds`: how long it is kept after its end.
         """
-        spec = job_spec(options, label, priority=priority, retention_seconds=retention_seconds)
+        spec = job_spec(options, label, batch, priority, retention_seconds)
         await run_sync(ensure_submittable, scan, spec.options)
         with ExitStack() as stack:
             archive = await run_sync(stack.enter_context, packed(scan))
-            memory = SubmissionMemory(self.config.url, archive.sha256, spec.options.model_dump_json(), label)
+            together = () if batch is None else (f"batch {batch}",)
+            memory = SubmissionMemory(self.config.url, archive.sha256, spec.options.model_dump_json(), label, *together)
             return await self._submit(memory, archive, spec, new, on_bytes)
 
     async def submit_remembered(self, memory: SubmissionMemory, scan: Path, spec: JobSpec) -> JobView:

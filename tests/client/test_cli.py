@@ -8,10 +8,12 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
 from fake_server import NOW, FakeServer, answers, refuses, view
+from typer.main import get_command
 from typer.testing import CliRunner, Result
 
 from advtex_client import cli, cli_batch
@@ -19,6 +21,8 @@ from advtex_client._display import duration, job_lines, job_table
 from advtex_client.client import Client
 from advtex_contract.errors import ErrorCode, ErrorDetail
 from advtex_contract.jobs import BatchView, JobError, JobPage, JobState, ResultFile
+from advtex_engine.__main__ import app as engine_app
+from advtex_options import described
 
 WHY = "no worker is running"
 
@@ -158,6 +162,27 @@ def test_options_out_of_bounds_are_2_and_named(
     assert ran.exit_code == 2
     assert words in ran.stderr
     assert server.requests == []
+
+
+def test_all_commands_that_make_jobs_have_every_option() -> None:
+    commands: Any = get_command(cli.app)
+    engine: Any = get_command(engine_app)
+    flags = {f"--{name.replace('_', '-')}" for name in described()}
+    for command in (
+        commands.commands["submit"],
+        commands.commands["batch"].commands["submit"],
+        engine.commands["texture"],
+    ):
+        found = {flag: one.help for one in command.params for flag in one.opts if flag in flags}
+        assert found.keys() == flags
+        assert all(about.help in found[f"--{name.replace('_', '-')}"] for name, about in described().items())
+
+
+def test_jobs_can_belong_together(server: FakeServer, scan: Path) -> None:
+    assert run("submit", scan, "--batch", "night").exit_code == 0
+    assert run("submit", scan).exit_code == 0
+    assert run("submit", scan, "--batch", "night").stdout == "j0\n"
+    assert [job.batch for job in server.jobs.values()] == ["night", None]
 
 
 def test_no_command_no_file_and_no_server_are_2(scan: Path, tmp_path: Path) -> None:

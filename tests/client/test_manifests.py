@@ -61,6 +61,13 @@ def test_csv(scenes: Path) -> None:
     assert (referred.options, referred.priority) == (QUICK, 1)
 
 
+def test_each_option_may_have_a_column(scenes: Path) -> None:
+    text = "path,size,steps,options\nscene0000_00,320x240,7,\nscene0000_01,,,{}\n"
+    first, second = read_items(write(scenes, "list.csv", text), QUICK)
+    assert first.options == QUICK.model_copy(update={"width": 320, "height": 240, "steps": 7})
+    assert second.options == QUICK
+
+
 def test_json_lines(scenes: Path) -> None:
     rows = [{"path": "scene0000_00", "options": {"steps": 7}}, {"path": "file:///data/x/", "priority": 9}]
     text = "\n".join(map(json.dumps, rows)) + "\n\n"

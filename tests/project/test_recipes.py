@@ -173,9 +173,19 @@ from advtex_contract.options import JobOptions
 from advtex_worker.adapt import texture_config
 print(texture_config(JobOptions(texels_per_pixel=2), "cpu").texels_per_pixel)
 """
+OPTION_ON_THE_PAGE = """
+from advtex_client.manifests import COLUMNS
+from advtex_server.routes.pages import submit_options
+about = {field["name"]: field["about"] for field in submit_options()}["texels_per_pixel"]
+print("texels_per_pixel", about.low, about.high, "texels_per_pixel" in COLUMNS)
+"""
 
 
 def test_an_option_is_added(copy: Path) -> None:
     follow("Add an option", copy)
     assert run(copy, "-c", OPTION) == "2.0\n"
-    assert "--texels-per-pixel" in run(copy, "-m", "advtex_engine", "texture", "--help")
+    client = ("-c", "from advtex_client.cli import main; main()")
+    for command in (("-m", "advtex_engine", "texture"), (*client, "submit"), (*client, "batch", "submit")):
+        told = " ".join(run(copy, *command, "--help").split())
+        assert "--texels-per-pixel N of the sharpest view, along each side. 0.25 to 4 texels [default: (1.2)]" in told
+    assert run(copy, "-c", OPTION_ON_THE_PAGE).split() == ["texels_per_pixel", "0.25", "4", "True"]

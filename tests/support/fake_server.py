@@ -134,7 +134,8 @@ class FakeServer:
             earlier, job_id = self.keys[key]
             return ok(self.jobs[job_id]) if earlier == body.decode() else error(422, ErrorCode.idempotency_mismatch)
         spec = JobSpec.model_validate_json(body)
-        job = view(f"j{len(self.jobs)}", self.begins, upload_id=spec.upload_id, options=spec.options, label=spec.label)
+        asked = {"options": spec.options, "label": spec.label, "batch": spec.batch}
+        job = view(f"j{len(self.jobs)}", self.begins, upload_id=spec.upload_id, **asked)
         job.retention_seconds = spec.retention_seconds or 0
         self.jobs[job.id] = job
         self.keys[key] = (body.decode(), job.id)

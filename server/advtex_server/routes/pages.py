@@ -55,11 +55,6 @@ _WORDS = {
     "stages": STAGE_LABELS,
 }
 _PRESETS = (Preset.auto, Preset.preview, Preset.standard, Preset.full, Preset.paper)  # by their cost
-_OPTIONS = [
-    {"name": name, "about": about, "kind": kind_of(name).__name__, "default": getattr(Options, name, None)}
-    for name, about in described().items()
-    if name != "preset"  # shown by itself, with what each costs
-]
 
 templates = jinja2.Environment(
     loader=jinja2.FileSystemLoader(Path(__file__).parents[1] / "templates"),
@@ -129,7 +124,16 @@ async def submit_page(request: Request, service: TheService) -> Response:
     caller = await _reader(request)
     data = {"max_upload_bytes": service.settings.max_upload_bytes}
     presets = [(preset, PRESET_HELP[preset], PRESET_COST[preset]) for preset in _PRESETS]
-    return _page("new.html", caller, data=data, presets=presets, options=_OPTIONS)
+    return _page("new.html", caller, data=data, presets=presets, options=submit_options())
+
+
+def submit_options() -> list[dict[str, Any]]:
+    """The options of the form, as the template's macro `option` takes them; the preset is shown by itself."""
+    return [
+        {"name": name, "about": about, "kind": kind_of(name).__name__, "default": getattr(Options, name, None)}
+        for name, about in described().items()
+        if name != "preset"
+    ]
 
 
 @router.get("/jobs/{job_id}")

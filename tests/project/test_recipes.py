@@ -172,6 +172,10 @@ OPTION = """
 from advtex_contract.options import JobOptions
 from advtex_worker.adapt import texture_config
 print(texture_config(JobOptions(texels_per_pixel=2), "cpu").texels_per_pixel)
+try:
+    JobOptions(texels_per_pixel=5)
+except ValueError as error:
+    print("out of bounds" in str(error))
 """
 OPTION_ON_THE_PAGE = """
 from advtex_client.manifests import COLUMNS
@@ -183,7 +187,7 @@ print("texels_per_pixel", about.low, about.high, "texels_per_pixel" in COLUMNS)
 
 def test_an_option_is_added(copy: Path) -> None:
     follow("Add an option", copy)
-    assert run(copy, "-c", OPTION) == "2.0\n"
+    assert run(copy, "-c", OPTION) == "2.0\nTrue\n"
     client = ("-c", "from advtex_client.cli import main; main()")
     for command in (("-m", "advtex_engine", "texture"), (*client, "submit"), (*client, "batch", "submit")):
         told = " ".join(run(copy, *command, "--help").split())

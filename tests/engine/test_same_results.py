@@ -11,7 +11,6 @@ import torch
 import torch.nn.functional as F
 
 from advtex_engine import pipeline
-from advtex_engine.adversarial import optimizer as optimize
 from advtex_engine.adversarial.discriminator import PatchDiscriminator
 from advtex_engine.adversarial.examples import InputForm
 from advtex_engine.adversarial.operations import plain_operations
@@ -78,8 +77,8 @@ def test_bfloat16_gives_the_same_quality_on_a_synthetic_scan(tmp_path: Path, mon
     synthesize(tmp_path / "scan", views=12, width=160, height=120)
     scores, textures = [], []
     for half in (False, True):
-        for module in (optimize, pipeline):
-            monkeypatch.setattr(module, "native_bfloat16", lambda _, half=half: half)
+        for module in ("adversarial.optimizer", "stages.atlas"):
+            monkeypatch.setattr(f"advtex_engine.{module}.native_bfloat16", lambda _, half=half: half)
         out = tmp_path / str(half)
         config = TextureConfig(preset="standard", steps=150, holdout=4, device="cpu")
         report = pipeline.texture_scan(tmp_path / "scan", out, config, work=out / "work").report

@@ -54,6 +54,7 @@ def test_gpus_have_as_many_jobs_as_they_may_and_others_step_in(service: LiveServ
     with service.client() as client:
         large = client.submit(scan, JobOptions(steps=9_000, width=2400, height=1800, preset="full")).id
         jobs = [client.submit(scan, JobOptions(steps=9_000, seed=seed)).id for seed in range(5)]
+        wait_until(lambda: all(records.job(job).state != JobState.checking for job in (large, *jobs)), 60)
         wait_until(lambda: len(runners(first.pid)) == 4, 60)
         assert runners(first.pid) == ["GPU-aaaa", "GPU-aaaa", "GPU-bbbb", "GPU-bbbb"]
         assert records.job(large).memory_bytes > 4 << 30, "the smaller GPU's slots are not for it"

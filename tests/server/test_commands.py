@@ -16,6 +16,7 @@ from typing import Any
 import httpx
 import psutil
 import pytest
+from checked import queued_job
 from click.testing import Result
 from databases import give_revision
 from typer.testing import CliRunner
@@ -247,7 +248,7 @@ def test_doctor_mends_what_rows_and_blobs_disagree_on(tmp_path: Path, run: Calla
     store = open_store(StoreSettings(data_dir=tmp_path))
     upload = store.uploads.create("me", 3)
     store.uploads.finish(upload.id, "ab" * 32)
-    job = store.submissions.create_job("me", JobSpec(upload_id=upload.id)).id
+    job = queued_job(store, "me", JobSpec(upload_id=upload.id))
     found = run(tmp_path, "doctor")
     assert found.exit_code == 3
     assert f"FAIL scans: 1 (--repair mends it): {job}: it waits for a scan whose bytes are gone" in found.stdout

@@ -54,6 +54,7 @@ def told(log: Path) -> list[dict[str, Any]]:
 
 
 @pytest.mark.one_machine("about the lines of a log")
+@pytest.mark.usefixtures("store")  # a schema that the worker needs
 def test_the_command_logs_json(start: Start, log: Path) -> None:
     start("-m", "advtex_worker.main")
     wait_until(lambda: "takes jobs" in log.read_text(), seconds=60)

@@ -22,7 +22,7 @@ from advtex_contract.jobs import ANY_STATE_HEADER, JobSpec
 from advtex_scan import check_scan
 from advtex_server import checking
 
-FACES = 1_000_000
+FACES = 1_500_000
 
 
 @pytest.fixture

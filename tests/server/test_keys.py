@@ -32,7 +32,7 @@ class FakeAccounts:
 
 
 class Door:
-    """A authenticator with a clock that is set by hand."""
+    """An authenticator with a clock that is set by hand."""
 
     def __init__(self, limit: int = 5) -> None:
         self.now = 0.0

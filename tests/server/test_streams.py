@@ -11,7 +11,7 @@ import httpx
 import pytest
 from sqlalchemy.exc import OperationalError
 
-from advtex_server import authenticator, browsers, streams
+from advtex_server import browsers, streams
 from advtex_store.accounts import Caller
 
 pytestmark = pytest.mark.one_machine("who may follow is asked as for every other call")
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.one_machine("who may follow is asked as for every other
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every message is asked about, and nobody is known from before."""
     monkeypatch.setattr(streams, "ASK_SECONDS", 0.0)
-    for module in (authenticator, browsers):
+    for module in (authentication, browsers):
         monkeypatch.setattr(module, "KNOWN_SECONDS", 0.0)
 
 

@@ -11,7 +11,7 @@ import httpx
 import pytest
 from sqlalchemy.exc import OperationalError
 
-from advtex_server import browsers, streams
+from advtex_server import authentication, browsers, streams
 from advtex_store.accounts import Caller
 
 pytestmark = pytest.mark.one_machine("who may follow is asked as for every other call")

@@ -91,9 +91,9 @@ def checkout(tmp_path: Path) -> Path:
 def test_both_take_steps_on_the_same_views(
     checkout: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("advtex_engine.bench.STEPS", 1)
-    monkeypatch.setattr("advtex_engine.bench.WARMUP", 1)
-    monkeypatch.setattr("advtex_engine.bench.LAUNCHES", 1)
+    monkeypatch.setattr("advtex_engine.bench.run.STEPS", 1)
+    monkeypatch.setattr("advtex_engine.bench.run.WARMUP", 1)
+    monkeypatch.setattr("advtex_engine.bench.run.LAUNCHES", 1)
     status = peer_step.main([str(checkout), *SMALL, "--json"])
     told = capsys.readouterr()
     assert status == 0, told.err

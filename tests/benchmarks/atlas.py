@@ -30,7 +30,7 @@ from advtex_engine.core.scene import Camera, Mesh
 from advtex_engine.mesh.clean import clean
 from advtex_engine.mesh.models import load_reference
 from advtex_engine.runtime.stage_records import peak_memory_bytes
-from advtex_engine.synthetic.object import working_views
+from advtex_engine.synthetic.object import look_at
 
 DATA = Path(os.environ.get("ADVTEX_DATA", Path(__file__).parents[3] / "shared" / "data"))
 SIDE = 8192
@@ -78,7 +78,7 @@ def cameras_about(mesh: Mesh, count: int = 24) -> list[Camera]:
     cameras = []
     for angle in np.arange(count) * 2 * np.pi / count:
         eye = middle + reach * np.array([0.3 * np.cos(angle), 0.3 * np.sin(angle), 0.5])
-        cameras.append(Camera(K, torch.from_numpy(working_views(eye, middle)), 1280, 960))
+        cameras.append(Camera(K, torch.from_numpy(look_at(eye, middle)), 1280, 960))
     return cameras
 
 

@@ -32,7 +32,7 @@ from advtex_engine.mesh.fusion import fuse
 from advtex_engine.mesh.models import load_model
 from advtex_engine.render.rasterize import rasterize
 from advtex_engine.runtime.stage_records import peak_memory_bytes, reset_peak_memory
-from advtex_engine.synthetic.object import working_views
+from advtex_engine.synthetic.object import look_at
 from advtex_engine.synthetic.scan import synthesize
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
@@ -72,7 +72,7 @@ def of_room(count: int) -> tuple[list[DepthFrame], Mesh]:
         angle = 2 * np.pi * index / count
         eye = np.array([1.0 * np.cos(angle), 0.8 * np.sin(angle), 1.4])
         towards = np.array([np.cos(7 * angle), np.sin(7 * angle), 0.9 * np.sin(11 * angle)])
-        camera = Camera(K, torch.from_numpy(working_views(eye, eye + towards)), 640, 480)
+        camera = Camera(K, torch.from_numpy(look_at(eye, eye + towards)), 640, 480)
         depth = rasterize(mesh, camera).depth
         noise = 0.0012 + 0.0019 * (depth - 0.4).clamp(min=0).square()  # Nguyen et al. 2012, axial noise of Kinect
         frames.append(DepthFrame(camera, depth + (depth > 0) * noise * torch.randn(depth.shape, generator=generator)))

@@ -31,7 +31,7 @@ from advtex_engine.core.monitor import Monitor
 from advtex_engine.ingest.frames import FrameStore
 from advtex_engine.ingest.read import read_capture
 from advtex_engine.mesh.clean import clean, decimate
-from advtex_engine.synthetic.object import working_views
+from advtex_engine.synthetic.object import look_at
 
 COLOR, DEPTH = (1296, 968), (640, 480)
 FOCAL = 1170.0  # of the color camera; both see the same
@@ -79,7 +79,7 @@ def _place(number: int) -> tuple[Floats, bytes, bytes, bytes]:
     angle = 2 * np.pi * number / PLACES
     eye = np.array([1.2 * np.cos(angle), 0.9 * np.sin(angle), 0.2 * np.sin(5 * angle)])
     towards = np.array([np.cos(angle), np.sin(angle), 0.5 * np.sin(7 * angle)])
-    camera_to_world = np.linalg.inv(working_views(eye, eye + towards))
+    camera_to_world = np.linalg.inv(look_at(eye, eye + towards))
     points, _ = _seen(camera_to_world, COLOR[0] // 2, COLOR[1] // 2)
     table = np.random.default_rng(1).integers(40, 200, (128, 128, 128, 3)).astype(np.uint8)
     x, y, z = ((points * GRAIN).astype(np.int64) % 128).transpose(2, 0, 1)

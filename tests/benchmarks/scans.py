@@ -30,8 +30,8 @@ from harness import (
     write_report,
 )
 
-from advtex_engine.core.config import METHODS, TextureConfig
-from advtex_engine.methods import MethodInput, require
+from advtex_engine.core.config import TextureConfig
+from advtex_engine.methods import METHODS, MethodInput, require
 from advtex_engine.pipeline import choose_device
 
 

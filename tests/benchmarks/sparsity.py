@@ -42,7 +42,8 @@ from harness import (
 from study import SCANS, make_named_scan
 from torch import Tensor
 
-from advtex_engine.core.config import METHODS, resolve_preset
+from advtex_engine.core.config import resolve_preset
+from advtex_engine.methods import METHODS
 from advtex_engine.metrics.lpips import Lpips
 from advtex_engine.runtime.devices import choose_device
 

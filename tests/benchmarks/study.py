@@ -43,8 +43,8 @@ from harness import (
     write_report,
 )
 
-from advtex_engine.core.config import METHODS, resolve_preset
-from advtex_engine.methods import MethodInput, require
+from advtex_engine.core.config import resolve_preset
+from advtex_engine.methods import METHODS, MethodInput, require
 from advtex_engine.metrics.lpips import Lpips, WeightsError
 from advtex_engine.runtime.devices import choose_device
 from advtex_engine.synthetic.scan import synthesize

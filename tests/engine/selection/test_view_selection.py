@@ -11,7 +11,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advtex_engine.core.config import METHODS as METHOD_NAMES
 from advtex_engine.core.config import PRESETS, TextureConfig
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Atlas, Camera, Mesh, Scene, View
@@ -23,6 +22,7 @@ from advtex_engine.previews.live import Live
 from advtex_engine.render.render_view import render_layers, render_view
 from advtex_engine.render.view_maps import build_view_maps
 from advtex_engine.runtime.checkpoint import WorkFolder
+from advtex_options.words import METHOD_HELP
 
 DATA = Path(os.environ.get("ADVTEX_DATA", Path(__file__).parents[3] / "../shared/data"))
 SIDE, CELLS = 128, 10
@@ -86,7 +86,7 @@ def error(selection: Selection) -> float:
 
 def test_the_method_is_registered() -> None:
     assert METHODS["view_selection"] is view_selection
-    assert "view_selection" in METHOD_NAMES
+    assert "view_selection" in METHOD_HELP
 
 
 def test_good_photographs_give_the_truth_back(tmp_path: Path) -> None:

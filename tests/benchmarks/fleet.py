@@ -235,8 +235,9 @@ class Simulation:
         return taken / watch.seconds
 
     def next_job(self, worker: Worker) -> float:
-        """The worker ends its job and takes the next. -> seconds in between."""
+        """The worker ends its job, somebody sends another, and it takes the next. -> seconds that it had none."""
         assert worker.held is not None
+        rows_of_jobs(self.store, 1, JobState.queued)
         self.store.records.succeed(*worker.held, [])
         worker.held = None
         watch = Stopwatch()

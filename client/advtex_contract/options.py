@@ -108,5 +108,16 @@ def chosen_options(given: Mapping[str, Any], usual: JobOptions | None = None) ->
         raise ValueError(told if name in told else f"options.{name}: {told}") from error
 
 
+def misunderstood(stored: Mapping[str, Any]) -> str | None:
+    """What stored options say that this version does not know, in a sentence; None where it knows all of it."""
+    if unknown := sorted(stored.keys() - JobOptions.model_fields.keys()):
+        return f"there is no option {', '.join(unknown)}"
+    try:
+        chosen_options(stored)
+    except ValueError as error:
+        return str(error)
+    return None
+
+
 _OPEN = {"layout"}
 """Options whose words another version may have more of: not checked where jobs are read."""

@@ -38,17 +38,21 @@ log = structlog.get_logger("advtex.dispatch")
 
 
 class Held:
-    """The attempts that wait in Redis, by class of workers, as one round has found them and changed them."""
+    """The attempts that wait in Redis, by class of workers, as one round has found them and changed them.
 
-    def __init__(self, by_class: Mapping[int, Iterable[str]]) -> None:
+    declined: those that must not wait there now. They stand in the line of rows still, and count with the others.
+    """
+
+    def __init__(self, by_class: Mapping[int, Iterable[str]], declined: Iterable[str]) -> None:
         self._by_class = {gib: set(names) for gib, names in by_class.items()}
+        self._declined = frozenset(declined)
 
     def __contains__(self, name: str) -> bool:
-        return any(name in names for names in self._by_class.values())
+        return name in self._declined or any(name in names for names in self._by_class.values())
 
     @property
     def total(self) -> int:
-        return sum(map(len, self._by_class.values()))
+        return len(self._declined) + sum(map(len, self._by_class.values()))
 
     def waiting(self, found: WorkerClass) -> int:
         """How many wait for a class."""
@@ -116,7 +120,7 @@ class Dispatcher:
         try:
             classes = queue.classes()
             queue.withdraw({found.gib for found in classes})
-            held = Held(queue.waiting_by_class([found.gib for found in classes]))
+            held = Held(queue.waiting_by_class([found.gib for found in classes]), queue.declined())
             before = held.total
             self._take_back(classes, held)
             for found in classes:

@@ -18,7 +18,7 @@ from sqlalchemy import func, select, update
 from advtex_contract.jobs import TERMINAL, WAITING, JobError, JobState
 from advtex_store import keys
 from advtex_store.counters import JOBS, count_end
-from advtex_store.errors import BlobNotFound, IllegalTransition, RecordNotFound, StaleAttempt
+from advtex_store.errors import BlobNotFound, IllegalTransition, NotUnderstood, RecordNotFound, StaleAttempt
 from advtex_store.ids import ID, created_at
 from advtex_store.models import CounterRow, EventRow, JobRow, UploadRow
 from advtex_store.partials import Hold
@@ -82,7 +82,7 @@ def _end_without_scan(store: Store, job: JobRow) -> str:
     try:
         store.records.claim(job.id, job.attempt, DOCTOR)
         store.records.fail(job.id, job.attempt, JobError(code="scan_missing", message=message))
-    except StaleAttempt:
+    except (StaleAttempt, NotUnderstood):
         return NOT_MENDED
     return "failed: its scan is gone"
 

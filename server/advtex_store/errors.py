@@ -40,6 +40,10 @@ class Superseded(StoreError):
     """A newer request goes on with the upload."""
 
 
+class NotUnderstood(StoreError):
+    """The job's options say what this release does not know."""
+
+
 class IdempotencyMismatch(StoreError):
     """The idempotency key was used before with another body."""
 

@@ -8,6 +8,7 @@ Redis: attempts, leases and limits live in the rows.
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
@@ -29,6 +30,8 @@ from advtex_store.settings import StoreSettings
 QUEUE = "advtex-"
 TASK = "advtex_worker.tasks.run_job"
 STARTED_GRACE_SECONDS = 10.0  # between taking an id and claiming the row; later the taker is held for dead
+DECLINED = "advtex:declined"  # attempts, scored by when they may be offered again
+DECLINED_SECONDS = 10.0
 PRESENCE = "advtex:worker:"
 BUSY = " busy"
 SCANNED = 10_000  # keys that Redis looks at in one go, a few milliseconds; there are some per worker
@@ -144,6 +147,17 @@ class JobQueue:
             return False
         age = (datetime.now(UTC) - (since if since.tzinfo else since.replace(tzinfo=UTC))).total_seconds()
         return age < STARTED_GRACE_SECONDS
+
+    def decline(self, job_id: str, attempt: int) -> None:
+        """Keep the attempt from being offered for some seconds: who was offered it cannot carry it, others may."""
+        self.redis.zadd(DECLINED, {rq_id(job_id, attempt): time.time() + DECLINED_SECONDS})
+
+    def declined(self) -> list[str]:
+        """`job-attempt` of what is not offered at the moment."""
+        pipeline = self.redis.pipeline()
+        pipeline.zremrangebyscore(DECLINED, "-inf", time.time())
+        pipeline.zrange(DECLINED, 0, -1)
+        return [_text(name) for name in pipeline.execute()[1]]
 
     def withdraw(self, keep: set[int]) -> None:
         """Take back what waits for workers of classes that are not in `keep`: nobody listens there any more."""

@@ -3,7 +3,8 @@
 How a worker carries a job (`store = open_store(settings)`; RQ calls `advtex_worker.tasks.run_job(job_id, attempt)`):
 
 1. `claim = store.records.claim(job_id, attempt, worker)`. `StaleAttempt` here means that somebody else has the job or
-   that it was canceled: return quietly, it is not an error.
+   that it was canceled: return quietly, it is not an error. `NotUnderstood`: `records.decline`, and leave it to a
+   worker that knows its options.
 2. `if store.results.adopt(job_id): return`: an earlier attempt had already finished, only its row was not told.
 3. Fetch the scan: `store.blobs.fetch(claim.scan_key, path)`. Resume: the files that the index of the newest attempt
    names (`keys.py`; the worker writes and reads the indexes).
@@ -39,12 +40,12 @@ from sqlalchemy.orm import Session
 
 from advtex_contract.errors import ErrorDetail
 from advtex_contract.jobs import RETRYABLE, STATES, TERMINAL, WAITING, JobError, JobState, Progress
-from advtex_contract.options import JobOptions
+from advtex_contract.options import JobOptions, misunderstood
 from advtex_store import keys
 from advtex_store.accounts import check_active_jobs
 from advtex_store.counters import ATTEMPTS, count_end, count_one
 from advtex_store.database import Database
-from advtex_store.errors import IllegalTransition, RecordNotFound, StaleAttempt
+from advtex_store.errors import IllegalTransition, NotUnderstood, RecordNotFound, StaleAttempt
 from advtex_store.fair_queue import WaitingJob, distinct_pairs, next_jobs, use_order_of_index
 from advtex_store.memory_estimate import GIB
 from advtex_store.models import KEPT, WAITS_FOR_A_REASON, EventRow, JobRow
@@ -53,6 +54,7 @@ from advtex_store.webhooks import tell_webhooks
 
 S = JobState
 POISON_DEATHS = 3
+DECLINED = "a worker of another release does not understand its options, upgrade the workers: "
 EXPLAINED = 1000  # waiting rows that are told in one go why they wait
 
 
@@ -89,7 +91,7 @@ class Records:
     # -- worker ---------------------------------------------------------------------------------------------------
 
     def claim(self, job_id: str, attempt: int, worker: str, lease_seconds: float | None = None) -> Claim:
-        """Take a waiting job. StaleAttempt: it is not waiting for this attempt (any more)."""
+        """Take a waiting job. StaleAttempt: it is not waiting for this attempt (any more). NotUnderstood: see there."""
         with self.database.write() as session:
             expires_at = self.database.now(session) + (lease_seconds or self.lease_seconds)
             row = self.move(
@@ -102,6 +104,8 @@ class Records:
                 reached_at_claim=JobRow.reached,
                 waiting_reason="",
             )
+            if (reason := misunderstood(row.options)) is not None:
+                raise NotUnderstood(reason)
             return Claim(
                 job_id=row.id,
                 attempt=row.attempt,
@@ -113,6 +117,14 @@ class Records:
                 progress=Progress.model_validate(row.progress),
                 lease=Lease(expires_at, row.cancel_requested),
             )
+
+    def decline(self, job_id: str, attempt: int, reason: str) -> None:
+        """Leave a waiting job to a worker of another release, and tell why it waits; its attempt is still to come."""
+        told = f"{DECLINED}{reason}"[:255]
+        mine = and_(JobRow.id == job_id, JobRow.attempt == attempt, JobRow.state.in_(WAITING))
+        with self.database.write() as session:
+            values = {"waiting_reason": told, "version": JobRow.version + 1, "updated_at": self.database.now(session)}
+            session.execute(update(JobRow).where(mine, JobRow.waiting_reason != told).values(**values))
 
     def lease(self, job_id: str, attempt: int) -> Lease:
         """The lease as it is, without a commit. StaleAttempt: it is lost."""
@@ -243,10 +255,12 @@ class Records:
     def explain(self, reason: str, *, above: int = -1, up_to: int | None = None) -> None:
         """Tell why jobs wait that need more than `above` and no more than `up_to` bytes of memory (whole GiB).
 
-        A thousand rows at most: where more wait, those that are left are told the next time.
+        A thousand rows at most: where more wait, those that are left are told the next time. What a worker declined
+        keeps the reason that it gave.
         """
         pairs = distinct_pairs(WAITS_FOR_A_REASON, JobRow.memory_gib, JobRow.waiting_reason)
         wrong = select(pairs.c.first, pairs.c.second).where(pairs.c.first > above // GIB, pairs.c.second != reason)
+        wrong = wrong.where(pairs.c.second.not_like(f"{DECLINED}%"))
         if up_to is not None:
             wrong = wrong.where(pairs.c.first <= up_to // GIB)
         with self.database.read() as session:

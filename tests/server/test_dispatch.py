@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from advtex_contract.jobs import JobSpec
 from advtex_server.dispatch import Dispatcher
 from advtex_server.service import IN_LINE, job_view
 from advtex_server.settings import ServerSettings
-from advtex_store import keys
+from advtex_store import keys, queue
 from advtex_store.queue import PRESENCE, queue_name
 from advtex_store.store import Store, open_store
 
@@ -291,3 +292,19 @@ def test_jobs_are_accepted_while_redis_is_away_and_start_when_it_is_back(
     own_redis.start()  # empty: what was in it is gone
     only_workers(live.store, GIB, GIB)
     until(lambda: in_redis(live.store) == [f"{first}-1", f"{second}-1"])
+
+
+def test_what_a_worker_declined_keeps_nobody_waiting(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    only_workers(store, GIB)
+    declined, others = [submit(store) for _ in range(12)], [submit(store) for _ in range(2)]
+    for job in declined:
+        store.queue.decline(job, 1)
+    dispatcher = Dispatcher(store, settings(store))
+    dispatcher.dispatch()
+    assert in_redis(store) == [f"{others[0]}-1"]
+    store.queue.redis.lpop(f"rq:queue:{queue_name(GIB)}")
+    store.records.claim(others[0], 1, "w")
+    now = time.time()
+    monkeypatch.setattr(queue.time, "time", lambda: now + queue.DECLINED_SECONDS + 1)
+    dispatcher.dispatch()
+    assert in_redis(store) == [f"{declined[0]}-1"]

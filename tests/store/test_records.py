@@ -9,11 +9,13 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from sqlalchemy import update
 
 from advtex_contract.errors import ErrorDetail
 from advtex_contract.jobs import STATES, TERMINAL, JobError, JobState, Progress
-from advtex_store.errors import IllegalTransition, RecordNotFound, StaleAttempt
-from advtex_store.records import POISON_DEATHS
+from advtex_store.errors import IllegalTransition, NotUnderstood, RecordNotFound, StaleAttempt
+from advtex_store.models import JobRow
+from advtex_store.records import DECLINED, POISON_DEATHS
 
 ERROR = JobError(code="engine", message="it broke")
 
@@ -315,3 +317,37 @@ def test_any_history_is_legal(sqlite_bench: Any, data: st.DataObject) -> None:
         assert ended == (after.finished_at is not None) == (after.expires_at is not None)
         assert (after.state == "running") == (after.lease_expires_at is not None)
         before = after
+
+
+@pytest.mark.parametrize("unknown", [{"sharpen": 2}, {"preset": "ultra"}, {"layout": "hologram"}, {"seed": "one"}])
+def test_a_job_of_another_release_is_left_to_it(bench: Any, unknown: dict[str, object]) -> None:
+    job = bench.job()
+    known = bench.records.job(job).options
+    edit(bench, job, options=known | unknown)
+    with pytest.raises(NotUnderstood) as told:
+        bench.records.claim(job, 1, "old")
+    (name,) = unknown
+    assert name in str(told.value)
+    assert bench.state(job) == ("queued", 1)
+    bench.records.decline(job, 1, str(told.value))
+    bench.records.explain("no worker")
+    row = bench.records.job(job)
+    assert (row.state, row.attempt, row.deaths) == ("queued", 1, 0)
+    assert row.waiting_reason == (DECLINED + str(told.value))[:255]
+    edit(bench, job, options=known)  # as a newer worker sees it
+    assert bench.records.claim(job, 1, "new").attempt == 1
+    assert bench.records.job(job).waiting_reason == ""
+
+
+def test_what_runs_meanwhile_is_not_declined(bench: Any) -> None:
+    job = bench.job()
+    bench.records.claim(job, 1, "new")
+    version = bench.records.job(job).version
+    bench.records.decline(job, 1, "there is no option sharpen")
+    row = bench.records.job(job)
+    assert (row.state, row.waiting_reason, row.version) == ("running", "", version)
+
+
+def edit(bench: Any, job_id: str, **values: object) -> None:
+    with bench.database.write() as session:
+        session.execute(update(JobRow).where(JobRow.id == job_id).values(**values))

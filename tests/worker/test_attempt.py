@@ -13,11 +13,13 @@ import fake_engines
 import pytest
 from attempts import in_background, result, step_of
 from live_service import wait_until
+from redis import Redis
 
 from advtex_contract.jobs import JobState
 from advtex_store import keys
 from advtex_store.errors import BlobsRefused, BlobsUnavailable, NoSpace, ReferenceUnreadable
 from advtex_store.models import JobRow
+from advtex_store.queue import JobQueue
 from advtex_store.results import Results
 from advtex_store.store import Store
 from advtex_worker.attempt import Attempt
@@ -343,3 +345,16 @@ def _edit(store: Store, job_id: str, **values: object) -> None:
         row = session.get_one(JobRow, job_id)
         for name, value in values.items():
             setattr(row, name, value)
+
+
+def test_a_job_of_another_release_is_declined(
+    store: Store, settings: WorkerSettings, redis_url: str, new_job: NewJob
+) -> None:
+    job_id = new_job()
+    _edit(store, job_id, options={**store.records.job(job_id).options, "sharpen": 2})
+    run_attempt(Host(settings.model_copy(update={"redis_url": redis_url}), engine="fake_engines:raises"), job_id, 1)
+    row = store.records.job(job_id)
+    assert (row.state, row.attempt, row.deaths, row.worker) == ("queued", 1, 0, None)
+    assert "sharpen" in row.waiting_reason
+    with Redis.from_url(redis_url) as connection:
+        assert JobQueue(connection).declined() == [f"{job_id}-1"]

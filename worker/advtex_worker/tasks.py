@@ -12,7 +12,7 @@ from types import FrameType
 
 import structlog
 
-from advtex_store.errors import RecordNotFound, StaleAttempt
+from advtex_store.errors import NotUnderstood, RecordNotFound, StaleAttempt
 from advtex_store.store import open_store
 from advtex_worker.attempt import Attempt, sweep
 from advtex_worker.runner import ENGINE
@@ -61,7 +61,7 @@ def serve_as(host: Host) -> None:
 
 
 def run_job(job_id: str, attempt: int) -> None:
-    """Claim the attempt and carry it to its end. Returns quietly when another one has the job."""
+    """Claim the attempt and carry it to its end. Returns quietly when another one has the job, or should have it."""
     run_attempt(_host or Host(WorkerSettings()), job_id, attempt)
 
 
@@ -73,6 +73,10 @@ def run_attempt(host: Host, job_id: str, attempt: int) -> None:
         claim = store.records.claim(job_id, attempt, f"{socket.gethostname()}-{os.getpid()}")
     except (StaleAttempt, RecordNotFound) as reason:
         log.info("nothing to do", job=job_id, attempt=attempt, reason=str(reason))
+    except NotUnderstood as reason:
+        log.warning("declined a job of another release", job=job_id, attempt=attempt, reason=str(reason))
+        store.records.decline(job_id, attempt, str(reason))
+        store.queue.decline(job_id, attempt)
     else:
         carried = Attempt(store, host.settings, host.engine, claim)
         host.stop_signal.watch(carried)

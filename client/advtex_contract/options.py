@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any, Self, get_type_hints
 
 from pydantic import (
@@ -19,9 +20,9 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from advtex_options import SIZE, Options, described, parse_size, refusal
-from advtex_options.words import METHOD_HELP, PRESET_COST, PRESET_HELP, Method, Preset
+from advtex_options.words import PRESET_COST, PRESET_HELP, Preset
 
-__all__ = ["METHOD_HELP", "PRESET_COST", "PRESET_HELP", "JobOptions", "Method", "Preset", "chosen_options"]
+__all__ = ["PRESET_COST", "PRESET_HELP", "JobOptions", "Preset", "chosen_options"]
 
 
 class _Checked(BaseModel, frozen=True):
@@ -65,18 +66,25 @@ def _described_fields() -> dict[str, Any]:
             default = kind(default)
         words = about.help if default is not None else f"{about.help}; left out: {about.unset}"
         longest = 40 if kind in (str, str | None) else None
-        field = Field(default=default, description=words, ge=about.low, le=about.high, max_length=longest)
+        offer = partial(_offer, about.choices) if kind is str and about.choices is not None else None
+        told: dict[str, Any] = {"description": words, "json_schema_extra": offer}
+        field = Field(default=default, ge=about.low, le=about.high, max_length=longest, **told)
         made[name] = (kind, field)
     return made
 
 
-_NARROWER: Mapping[str, Any] = {"preset": Preset, "method": Method}
+def _offer(choices: Mapping[str, str], schema: dict[str, Any]) -> None:
+    """Describe an open word: one of those that are known where it is described, or another."""
+    word = {name: schema.pop(name) for name in ("type", "maxLength")}
+    schema["anyOf"] = [{"type": "string", "enum": list(choices)}, word]
+
+
+_NARROWER: Mapping[str, Any] = {"preset": Preset}
 
 if TYPE_CHECKING:
 
     class JobOptions(_Checked, Options, frozen=True):
         preset: Preset = Preset.auto
-        method: Method = Method.adversarial
         width: int | None = None
         height: int | None = None
 else:
@@ -119,5 +127,5 @@ def misunderstood(stored: Mapping[str, Any]) -> str | None:
     return None
 
 
-_OPEN = {"layout"}
-"""Options whose words another version may have more of: not checked where jobs are read."""
+_OPEN = {"layout", "method"}
+"""Options whose words another version, or another installation, may have more of: not checked where jobs are read."""

@@ -1,7 +1,8 @@
 """What a user may ask for, described once: standard library only, but for `flags`, which needs typer.
 
 options.py   every option: its type, default, bounds, help and how the page shows it
-words.py     presets and methods by name, with their help
+words.py     presets by name, with their help
+methods.py   texturing methods: a record of each, also of other packages'
 flags.py     the options as flags of a command line
 
 The API (`advtex_contract.options`), the engine's configuration (`advtex_engine.core.config`), the page's form, all

@@ -15,7 +15,8 @@ from functools import cache
 from types import MappingProxyType
 from typing import Any, TypeVar, get_type_hints
 
-from advtex_options.words import METHOD_HELP, PRESET_HELP, Method, Preset
+from advtex_options.methods import METHOD_HELP
+from advtex_options.words import PRESET_HELP, Preset
 from advtex_scan.layouts import LAYOUT_NAMES
 
 FACE_BUDGET = 80_000
@@ -29,7 +30,8 @@ class Described:
     """What is told about an option, in the API, on the page and on the command line.
 
     help: a phrase. label: the page's name for it. low, high: bounds, both included, of what is a number; `unit` says
-    of what. choices: the words that it may be, with their help where they have one. unset: what happens without it.
+    of what. choices: the words that it may be, with their help where they have one; `others` says how there come to be
+    more. unset: what happens without it.
     offers: values among which the page lets choose, with what it calls them; `offered` is chosen there to begin with.
     """
 
@@ -40,6 +42,7 @@ class Described:
     high: float | None = None
     unit: str = ""
     choices: Mapping[str, str] | None = None
+    others: str = ""
     offers: tuple[tuple[str, str], ...] = ()
     offered: str = ""
 
@@ -60,7 +63,13 @@ class Options:
     """What a user may set. Everything has a default that suits most scans."""
 
     preset: str = option(Preset.auto.value, "how much work the optimization does", "Preset", choices=PRESET_HELP)
-    method: str = option(Method.adversarial.value, "how the texture is made", "Method", choices=METHOD_HELP)
+    method: str = option(
+        "adversarial",
+        "how the texture is made",
+        "Method",
+        choices=METHOD_HELP,
+        others="install the package that brings it",
+    )
     steps: int | None = option(None, "steps of the optimization", "Steps", unset="the preset's", low=1, high=1_000_000)
     face_budget: int | None = option(
         None,
@@ -147,7 +156,7 @@ def refusal(name: str, value: object) -> str | None:
     """
     sides = ("size", "width", "height")
     about = SIZE if name in sides else described()[name]
-    unset = f", or leave it out ({about.unset})"
+    unset = f", or leave it out ({about.unset})" + (f", or {about.others}" if about.others else "")
     shown = "x".join(map(str, value)) if isinstance(value, tuple) else repr(value)[:60]
     if about.choices is not None:
         known = isinstance(value, str) and value in about.choices

@@ -8,6 +8,7 @@ from contextlib import asynccontextmanager, suppress
 
 from fastapi import FastAPI
 
+from advtex_options.methods import known_methods
 from advtex_scan.version import product_version
 from advtex_server import errors
 from advtex_server.access import AccessMiddleware
@@ -45,6 +46,7 @@ def create_app(settings: ServerSettings) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         await asyncio.to_thread(upgrade_database, settings.database)
+        known_methods()  # the log says at once which ones of other packages cannot be used
         tasks = [asyncio.create_task(dispatcher.run()), asyncio.create_task(deliverer.run())]
         checker.start()
         yield

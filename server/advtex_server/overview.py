@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.concurrency import run_in_threadpool
 
-from advtex_contract.options import Method, Preset
+from advtex_contract.options import Preset
 from advtex_server.events import PING_SECONDS
 from advtex_store.models import JobRow
 from advtex_store.overviews import Overviews
@@ -29,7 +29,7 @@ class JobSummary(BaseModel):
     label: str
     batch: str | None
     preset: Preset
-    method: Method
+    method: str
     stage: str
     step: int
     steps: int

@@ -26,6 +26,7 @@ from advtex_contract.jobs import (
 )
 from advtex_contract.live import LiveImage, LiveRecord, LiveView
 from advtex_contract.options import JobOptions
+from advtex_options import refusal
 from advtex_server.batches import BatchService
 from advtex_server.older_clients import told
 from advtex_server.refusal import ApiError
@@ -89,6 +90,7 @@ class Service:
                 return told(job_view(held)), False
             reservation = held
         try:
+            _check_method(spec.options.method)
             self._look(owner, spec)
             row = self.store.submissions.create_job(
                 owner, spec, reservation=reservation, max_active_jobs=caller.max_active_jobs
@@ -220,6 +222,14 @@ def job_view(row: JobRow) -> JobView:
         retention_seconds=row.retention_seconds,
         expires_at=_time(row.expires_at) if row.expires_at else None,
     )
+
+
+def _check_method(name: str) -> None:
+    """Refuse a method that is not known here, before anything is done for it."""
+    if (words := refusal("method", name)) is not None:
+        where, remedy = "body.options.method", "choose one of these, or ask the operator to install the package"
+        detail = ErrorDetail(code="unknown_method", where=where, message=words, remedy=remedy)
+        raise ApiError(ErrorCode.invalid_options, f"{where}: {words}", [detail])
 
 
 def _canonical(spec: JobSpec) -> bytes:

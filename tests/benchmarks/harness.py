@@ -33,7 +33,7 @@ from advtex_engine.core.scene import Atlas, Camera, Mesh, View
 from advtex_engine.ingest.read import ingest
 from advtex_engine.mesh.clean import clean, decimate
 from advtex_engine.mesh.models import load_model
-from advtex_engine.methods import METHODS, MethodInput
+from advtex_engine.methods import MethodInput, texture_function
 from advtex_engine.methods.adversarial import starting_texture
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.view_selection import select_views
@@ -50,6 +50,7 @@ from advtex_engine.runtime.checkpoint import WorkFolder
 from advtex_engine.runtime.files import write_atomically
 from advtex_engine.selection.toning import tone_views
 from advtex_engine.synthetic.scan import SUPERSAMPLE, TRUTH
+from advtex_options.methods import known_methods
 
 RESULTS = Path(__file__).parent / "results"
 SHOWN_VIEW = 4  # of the held-out ones
@@ -126,9 +127,10 @@ def moved(mesh: Mesh, device: torch.device) -> Mesh:
 def run_method(given: MethodInput, method: str) -> Tensor:
     """The method's texture [H,W,3] on the CPU, from the start: what an earlier method left behind is cleared."""
     given.work.clear()
-    if method.startswith("adversarial"):
+    if known_methods()[method].plays_game:
         given = started(given)
-    texture, _ = METHODS[method](dataclasses.replace(given, config=dataclasses.replace(given.config, method=method)))
+    given = dataclasses.replace(given, config=dataclasses.replace(given.config, method=method))
+    texture, _ = texture_function(method)(given)
     return fill_holes(texture, given.maps[1].slot_map >= 0).cpu()
 
 

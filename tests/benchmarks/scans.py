@@ -31,14 +31,17 @@ from harness import (
 )
 
 from advtex_engine.core.config import TextureConfig
-from advtex_engine.methods import METHODS, MethodInput, require
+from advtex_engine.methods import MethodInput, require
 from advtex_engine.pipeline import choose_device
+from advtex_options.methods import known_methods
 
 
 def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scans", nargs="+", type=Path, help="folders or zip files")
-    parser.add_argument("--methods", nargs="+", default=[name for name in METHODS if name != "vgg"], choices=METHODS)
+    methods = known_methods()
+    usual = [name for name, method in methods.items() if not method.weights]
+    parser.add_argument("--methods", nargs="+", default=usual, choices=methods)
     parser.add_argument("--holdout", type=int, default=8)
     parser.add_argument("--size", default="640x480", help="WIDTHxHEIGHT of the views")
     parser.add_argument("--preset", default="standard")

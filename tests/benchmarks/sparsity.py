@@ -43,9 +43,9 @@ from study import SCANS, make_named_scan
 from torch import Tensor
 
 from advtex_engine.core.config import resolve_preset
-from advtex_engine.methods import METHODS
 from advtex_engine.metrics.lpips import Lpips
 from advtex_engine.runtime.devices import choose_device
+from advtex_options.methods import known_methods
 
 VIRTUAL, PERTURBATION = "adversarial_virtual", 0.01
 SHOWN = ("l1", "view_selection", "adversarial", VIRTUAL)
@@ -56,7 +56,7 @@ def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--every", nargs="+", type=int, default=[1, 2, 5, 10, 20])
     parser.add_argument("--scans", nargs="+", default=list(SCANS), choices=SCANS)
     parser.add_argument("--seed", type=int, default=0, help="of the scans")
-    parser.add_argument("--methods", nargs="+", default=SHOWN, choices=[*METHODS, VIRTUAL])
+    parser.add_argument("--methods", nargs="+", default=SHOWN, choices=[*known_methods(), VIRTUAL])
     parsed: argparse.Namespace = parser.parse_args(line)
     return parsed
 

@@ -44,10 +44,11 @@ from harness import (
 )
 
 from advtex_engine.core.config import resolve_preset
-from advtex_engine.methods import METHODS, MethodInput, require
+from advtex_engine.methods import MethodInput, require
 from advtex_engine.metrics.lpips import Lpips, WeightsError
 from advtex_engine.runtime.devices import choose_device
 from advtex_engine.synthetic.scan import synthesize
+from advtex_options.methods import known_methods
 
 OBJECT_SIZE = 0.3
 """Metres, of the synthetic object: the unit of the paper's errors."""
@@ -67,14 +68,16 @@ def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--errors", nargs="+", default=["cameras", "geometry"], choices=["cameras", "geometry"])
     parser.add_argument("--levels", nargs="+", type=float, default=[1.0, 2.75, 4.5], help="n of the error's size")
     parser.add_argument("--turn", type=float, default=5.0, help="e_a in degrees")
-    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS)
+    parser.add_argument("--methods", nargs="+", default=list(known_methods()), choices=known_methods())
     parsed: argparse.Namespace = parser.parse_args(line)
     return parsed
 
 
 def cells(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """The settings of every cell, scan by scan and for each scan with the given cameras first."""
-    methods = sorted(arguments.methods, key=lambda method: (arguments.refine or method == "colormap", method))
+    methods = sorted(
+        arguments.methods, key=lambda method: (arguments.refine or known_methods()[method].refines_cameras, method)
+    )
     for model in range(arguments.models):
         for errors in arguments.errors:
             for level in arguments.levels:

@@ -13,15 +13,12 @@ from pydantic import ValidationError
 
 from advtex_contract.errors import ErrorBody, ErrorCode, ErrorDetail
 from advtex_contract.jobs import RETRYABLE, STATES, TERMINAL, JobSpec, JobState, JobView
-from advtex_contract.options import METHOD_HELP, PRESET_HELP, JobOptions, Method, Preset
+from advtex_contract.options import PRESET_HELP, JobOptions, Preset, chosen_options
+from advtex_options.methods import METHOD_HELP
 
 
 def test_every_preset_is_explained() -> None:
     assert set(PRESET_HELP) == set(Preset)
-
-
-def test_every_method_is_explained() -> None:
-    assert set(METHOD_HELP) == set(Method)
 
 
 def test_defaults_suit_most_scans() -> None:
@@ -57,10 +54,23 @@ def test_half_a_size_is_refused(side: str) -> None:
         JobOptions.model_validate({side: 100})
 
 
-@pytest.mark.parametrize("options", [{"preset": "fastest"}, {"method": "magic"}, {"stpes": 3}])
+@pytest.mark.parametrize("options", [{"preset": "fastest"}, {"method": "m" * 41}, {"stpes": 3}])
 def test_unknown_options_are_refused(options: dict[str, object]) -> None:
     with pytest.raises(ValidationError, match=next(iter(options))):
         JobOptions.model_validate(options)
+
+
+@pytest.mark.parametrize("name", ["method", "layout"])
+def test_words_that_another_installation_may_know_are_refused_where_they_are_chosen_only(name: str) -> None:
+    assert getattr(JobOptions.model_validate({name: "magic"}), name) == "magic"
+    with pytest.raises(ValueError, match=f"{name} 'magic' is unknown; choose one of "):
+        chosen_options({name: "magic"})
+
+
+def test_known_methods_are_offered() -> None:
+    known, another = JobOptions.model_json_schema()["properties"]["method"]["anyOf"]
+    assert known["enum"] == list(METHOD_HELP)
+    assert another == {"type": "string", "maxLength": 40}
 
 
 @given(st.text(max_size=250))

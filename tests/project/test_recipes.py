@@ -9,9 +9,10 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
-from tiny_scan import FOCAL, HEIGHT, PLY, WIDTH, png
+from tiny_scan import FOCAL, HEIGHT, PLY, WIDTH, png, write_scan
 
 ROOT = Path(__file__).parents[2]
 ROOMS = ("client", "server", "worker")
@@ -156,16 +157,61 @@ def test_an_endpoint_is_added(copy: Path, tmp_path: Path) -> None:
     assert run(copy, "-c", ENDPOINT, tmp_path / "data").splitlines()[-1] == "0 0"  # after the log
 
 
+def textured(root: Path, tmp_path: Path, method: str, **environment: str) -> dict[str, Any]:
+    """The report of a run of the engine on a tiny scan."""
+    scan, flags = write_scan(tmp_path / "scan"), ("--method", method, "--no-refine", "--device", "cpu")
+    run(root, "-m", "advtex_engine", "texture", scan, "-o", tmp_path / "out", *flags, **environment)
+    report: dict[str, Any] = json.loads((tmp_path / "out" / "report.json").read_text())
+    return report
+
+
 @pytest.mark.slow
 def test_a_method_is_added(copy: Path, tmp_path: Path) -> None:
     follow("Add a method", copy)
-    engine, small = ("-m", "advtex_engine"), ("--size", "96x72")
-    run(copy, *engine, "synthesize", tmp_path / "scan.zip", "--views", 6, *small)
-    flags = ("--method", "first_view", "--preset", "preview", "--no-refine", "--device", "cpu", *small)
-    run(copy, *engine, "texture", tmp_path / "scan.zip", "-o", tmp_path / "out", *flags)
-    report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert report["options"]["method"] == "first_view"
+    assert textured(copy, tmp_path, "first_view")["options"]["method"] == "first_view"
     assert "first_view: each face" in run(copy, "-c", "from advtex_client.cli import main; main()", "submit", "--help")
+
+
+SERVER = """
+import sys
+from starlette.testclient import TestClient
+from advtex_options.methods import known_methods
+from advtex_server.app import create_app
+from advtex_server.settings import ServerSettings
+
+app = create_app(ServerSettings(data_dir=sys.argv[1], redis_url="redis://127.0.0.1:1/0"))
+with TestClient(app) as http:
+    http.headers["Authorization"] = "Bearer " + app.state.service.store.accounts.create_key("me", owner="me")
+    upload = http.post("/v1/uploads", content=b"not a zip").json()["id"]
+    for place in ("/nowhere", sys.argv[2]):
+        sys.path.append(place)
+        known_methods.cache_clear()
+        answer = http.post("/v1/jobs", json={"upload_id": upload, "options": {"method": "last_view"}})
+        print(answer.status_code, answer.json().get("message", answer.json().get("options")))
+"""
+
+
+@pytest.mark.slow
+def test_a_package_brings_a_method(tmp_path: Path) -> None:
+    lines = 0
+    for _, text in blocks("Bring a method in a package of your own"):
+        path = tmp_path / "source" / text.partition("\n")[0].removeprefix("# ")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+        lines += text.count("\n")
+    assert lines < 40
+    site = tmp_path / "site"
+    pip = ("-m", "pip", "--disable-pip-version-check", "install", "--no-index", "--no-deps", "--no-build-isolation")
+    run(ROOT, *pip, "--target", site, tmp_path / "source")
+    paths = os.pathsep.join(map(str, (*(ROOT / room for room in ROOMS), site)))
+
+    told = run(ROOT, "-c", SERVER, tmp_path / "data", site)
+    assert re.search(r"^422 body.options.method: method 'last_view' is unknown; choose one of", told, re.MULTILINE)
+    assert re.search(r"^201 .*'method': 'last_view'", told, re.MULTILINE)
+    client = ("-c", "from advtex_client.cli import main; main()")
+    assert "last_view: each face" in run(ROOT, *client, "submit", "--help", PYTHONPATH=paths)
+
+    assert textured(ROOT, tmp_path, "last_view", PYTHONPATH=paths)["options"]["method"] == "last_view"
 
 
 OPTION = """

@@ -172,10 +172,11 @@ def test_a_bad_scan(
         ({"options": {"steps": 0}}, "body.options.steps"),
         ({"options": {"width": 5000, "height": 64}}, "body.options.width"),
         ({"options": {"preset": "fastest"}}, "body.options.preset"),
+        ({"options": {"method": "magic"}}, "body.options.method"),
         ({"options": {"wdith": 640}}, "body.options.wdith"),
         ({"lable": "chair"}, "body.lable"),
     ],
-    ids=["below", "above", "preset", "option-name", "field-name"],
+    ids=["below", "above", "preset", "method", "option-name", "field-name"],
 )
 def test_a_bad_request(
     live: Any, is_error: Any, capsys: pytest.CaptureFixture[str], spec: dict[str, Any], where: str

@@ -18,7 +18,7 @@ from advtex_engine.conventions import checked_conventions
 from advtex_engine.core import Diverged, Monitor, TextureConfig, WarningKeeper
 from advtex_engine.ingest import FrameStore, read_capture
 from advtex_engine.mesh import MAX_FRAMES, fuse, register_mesh
-from advtex_engine.methods import METHODS, require
+from advtex_engine.methods import require, texture_function
 from advtex_engine.metrics.speckle import speckle_share
 from advtex_engine.previews.curves import curves
 from advtex_engine.render import fill_holes
@@ -86,7 +86,7 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
     given = method_input(scene, atlas, maps, work, budget, stages)
     budget.begin(given.held_bytes)
     with stages.run("optimization"):
-        texture, losses = METHODS[config.method](given)
+        texture, losses = texture_function(config.method)(given)
         budget.folder.earlier_seconds = given.work.earlier_seconds
     if not bool(texture.isfinite().all()):
         raise Diverged(f"the texture of the method {config.method} is not finite everywhere; choose another method")

@@ -53,6 +53,7 @@ _WORDS = {
         for state, facts in STATES.items()
     },
     "stages": STAGE_LABELS,
+    "usual_method": Options.method,
 }
 _PRESETS = (Preset.auto, Preset.preview, Preset.standard, Preset.full, Preset.paper)  # by their cost
 

@@ -1,9 +1,10 @@
 // What all pages share: calls of the API, streams that come back by themselves, words for numbers, elements.
 
 export const data = JSON.parse(document.getElementById("data").textContent);
-// The words of states and stages, in their order: `STATES` and `STAGE_LABELS` of the contract.
-const { states, stages } = JSON.parse(document.getElementById("words").textContent);
+// The words of states and stages, in their order: `STATES` and `STAGE_LABELS` of the contract; the method of who names none.
+const { states, stages, usual_method: usualMethod } = JSON.parse(document.getElementById("words").textContent);
 export const STAGES = Object.keys(stages);
+export const USUAL_METHOD = usualMethod;
 export const TERMINAL = Object.keys(states).filter((state) => states[state].terminal);
 export const RETRYABLE = TERMINAL.filter((state) => states[state].retryable);
 const RETURN_MS = 2000;

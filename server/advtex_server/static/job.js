@@ -1,6 +1,6 @@
 // One job: where it stands, live while it runs, and what came of it.
 
-import { RETRYABLE, STAGES, TERMINAL, ask, badge, bytes, call, count, data, duration, el, findings, follow, meter, moment, notice, stageName } from "./base.js";
+import { RETRYABLE, STAGES, TERMINAL, USUAL_METHOD, ask, badge, bytes, call, count, data, duration, el, findings, follow, meter, moment, notice, stageName } from "./base.js";
 import { showCurves } from "./chart.js";
 import { showResult, showScan, showStages } from "./result.js";
 
@@ -14,7 +14,7 @@ let looked = 0;
 function showHeading() {
   const { options } = job;
   const size = options.width ? `${options.width}×${options.height}` : null;
-  const facts = [options.preset, options.method === "adversarial" ? null : options.method, size,
+  const facts = [options.preset, options.method === USUAL_METHOD ? null : options.method, size,
     options.holdout && `every ${options.holdout}th frame held out`, job.attempt > 1 && `attempt ${job.attempt}`];
   byId("facts").replaceChildren(facts.filter(Boolean).join(" · "), " · ", moment(job.created_at),
     job.batch ? " · batch " : "", job.batch ? el("a", { href: `/?batch=${encodeURIComponent(job.batch)}` }, job.batch) : "",

@@ -1,6 +1,6 @@
 // The list of jobs: drawn from what the page brought, kept up to date by the stream of changes.
 
-import { TERMINAL, ask, badge, call, count, data, duration, el, follow, meter, moment, notice, placeholder, stageName, tone } from "./base.js";
+import { TERMINAL, USUAL_METHOD, ask, badge, call, count, data, duration, el, follow, meter, moment, notice, placeholder, stageName, tone } from "./base.js";
 
 const BATCH_MS = 2000;
 const list = document.getElementById("jobs");
@@ -31,7 +31,7 @@ function work(job) {
 }
 
 function row(job) {
-  const facts = [job.preset, job.method === "adversarial" ? null : job.method, job.batch && `batch ${job.batch}`];
+  const facts = [job.preset, job.method === USUAL_METHOD ? null : job.method, job.batch && `batch ${job.batch}`];
   const name = el("div", {},
     el("a", { href: `/jobs/${job.id}` }, job.label || `Job ${job.id.slice(-6)}`),
     el("p", { class: "hint" }, facts.filter(Boolean).join(" · "), " · ", moment(job.created_at)));

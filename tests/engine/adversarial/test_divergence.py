@@ -14,7 +14,7 @@ from advtex_engine.adversarial.optimizer import AdversarialOptimizer
 from advtex_engine.core.config import PRESETS, TextureConfig
 from advtex_engine.core.errors import Diverged, Problem
 from advtex_engine.core.monitor import Monitor
-from advtex_engine.methods import METHODS
+from advtex_engine.methods import mean
 from advtex_engine.pipeline import texture_scan
 from advtex_engine.runtime.checkpoint import Checkpoints
 from advtex_engine.runtime.files import json_text
@@ -100,8 +100,8 @@ def test_a_run_that_diverges_once_goes_on_from_its_last_checkpoint_with_half_the
 def test_no_methods_texture_is_exported_with_holes_in_its_numbers(
     scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mean = METHODS["mean"]
-    monkeypatch.setitem(METHODS, "mean", lambda given: (mean(given)[0].fill_(math.nan), []))
+    sound = mean.mean
+    monkeypatch.setattr(mean, "mean", lambda given: (sound(given)[0].fill_(math.nan), []))
     config = dataclasses.replace(CONFIG, method="mean", steps=None)
     with pytest.raises(Diverged, match="the method mean is not finite"):
         texture_scan(scan, tmp_path / "out", config, work=tmp_path / "work")

@@ -20,6 +20,7 @@ from advtex_engine.budget.workload import Workload, estimate
 from advtex_engine.core.config import PRESETS, TextureConfig
 from advtex_engine.core.errors import MemoryShortage, Problem, Stopped
 from advtex_engine.core.monitor import Monitor, WarningKeeper
+from advtex_engine.methods import MethodInput, adversarial
 from advtex_engine.pipeline import texture_scan
 from advtex_engine.render.streaming import LEAST_VIEWS
 from advtex_engine.runtime.checkpoint import WorkFolder
@@ -288,11 +289,11 @@ def test_a_texture_that_does_not_fit_is_made_smaller_and_then_the_job_fails_in_w
     config = replace(CONFIG, texels_per_pixel=4.0)
     sides = list[int]()
 
-    def refuses(given: pipeline.MethodInput) -> Any:
+    def refuses(given: MethodInput) -> Any:
         sides.append(given.maps[1].slot_map.shape[0])
         raise RuntimeError("[enforce fail at alloc_cpu.cpp:127] DefaultCPUAllocator: can't allocate memory")
 
-    monkeypatch.setitem(pipeline.METHODS, "adversarial", refuses)
+    monkeypatch.setattr(adversarial, "adversarial", refuses)
     with pytest.raises(MemoryShortage, match=r"optimization ran out of memory .*needs [0-9.]+ GiB.*choose a smaller"):
         texture_scan(scan, tmp_path, config, work=tmp_path / "work", monitor=Listener())
     assert sides == sorted(sides, reverse=True)

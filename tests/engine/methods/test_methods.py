@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -20,7 +21,7 @@ from advtex_engine.core.config import PRINTED, PyramidLevel, TextureConfig
 from advtex_engine.core.errors import Stopped
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Atlas, Camera, Mesh, Scene, View
-from advtex_engine.methods import METHODS, MethodInput, descent
+from advtex_engine.methods import MethodInput, descent, texture_function
 from advtex_engine.methods.best_view import label_faces
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.sharpest import sharpness
@@ -36,7 +37,7 @@ from advtex_engine.render.view_maps import build_view_maps
 from advtex_engine.runtime.checkpoint import WorkFolder
 from advtex_engine.synthetic.object import look_at
 from advtex_engine.synthetic.planar import planar_maps
-from advtex_options.words import METHOD_HELP
+from advtex_options.methods import BUILT_IN, Method
 
 SIDE, CELLS = 96, 8  # texels of the plane's side, and its quads
 WIDTH, HEIGHT = 96, 80
@@ -103,13 +104,17 @@ def around(tmp_path: Path) -> MethodInput:
     return task(atlas, views, tmp_path)
 
 
-def test_the_table_of_methods_is_that_of_the_configuration() -> None:
-    assert set(METHODS) == set(METHOD_HELP)
+@pytest.mark.parametrize("method", BUILT_IN, ids=lambda method: method.name)
+def test_what_a_record_names_is_there(method: Method) -> None:
+    for place in filter(None, (method.function, method.weights)):
+        module, _, function = place.partition(":")
+        assert module.startswith("advtex_engine.methods.")
+        assert callable(getattr(importlib.import_module(module), function))
 
 
 @pytest.mark.parametrize("name", ["mean", "l1", "best_view", "sharpest"])
 def test_without_errors_every_method_finds_the_texture(name: str, around: MethodInput) -> None:
-    texture, _ = METHODS[name](around)
+    texture, _ = texture_function(name)(around)
     assert texture.shape == (SIDE, SIDE, 3)
     seen = around.maps[1].slot_map >= 0
     assert (texture - truth())[seen].abs().mean() < 0.01
@@ -161,8 +166,8 @@ def test_the_sharpest_photograph_wins_over_a_nearer_blurred_one(tmp_path: Path) 
     planes = near.color.permute(2, 0, 1)[None].float()
     blurred = F.avg_pool2d(planes, 7, 1, 3, count_include_pad=False)[0].permute(1, 2, 0).round().to(torch.uint8)
     given = task(atlas, (replace(near, color=blurred), far), tmp_path)
-    nearest, _ = METHODS["best_view"](given)
-    sharpest, _ = METHODS["sharpest"](given)
+    nearest, _ = texture_function("best_view")(given)
+    sharpest, _ = texture_function("sharpest")(given)
 
     def contrast(image: Tensor) -> float:
         return float(image[20:-20, 20:-20].std())
@@ -195,7 +200,7 @@ def flat_task(work: Path, monitor: Monitor | None = None, **config: object) -> t
 
 def test_l1_is_the_median_where_every_pixel_is_one_texel(tmp_path: Path) -> None:
     given, color = flat_task(tmp_path, steps=3000)
-    texture, losses = METHODS["l1"](given)
+    texture, losses = texture_function("l1")(given)
     median = color.float().median(0).values / 255
     # The codes of texture coordinates are 1/65535 apart, so the pixels are not exactly the texels.
     assert (texture - median).abs().mean() < 0.01
@@ -210,7 +215,7 @@ def test_l1_sees_every_view_equally_often(tmp_path: Path) -> None:
     maps = given.maps[1]
     depth = maps.depth.clone()
     depth[3] = 0
-    _, losses = METHODS["l1"](replace(given, maps={1: replace(maps, depth=depth)}))
+    _, losses = texture_function("l1")(replace(given, maps={1: replace(maps, depth=depth)}))
     assert losses[-1]["step"] % 4 == 0
     assert losses[-1]["step"] >= 40
 
@@ -228,16 +233,16 @@ class Stopper(Monitor):
 
 
 def test_a_descent_that_is_stopped_goes_on_to_the_same_texture(tmp_path: Path) -> None:
-    whole, losses = METHODS["l1"](flat_task(tmp_path / "whole", steps=30)[0])
+    whole, losses = texture_function("l1")(flat_task(tmp_path / "whole", steps=30)[0])
     with pytest.raises(Stopped, match="after step 11 of 30"):
-        METHODS["l1"](flat_task(tmp_path / "parts", Stopper(11), steps=30)[0])
-    resumed, later = METHODS["l1"](flat_task(tmp_path / "parts", steps=30)[0])
+        texture_function("l1")(flat_task(tmp_path / "parts", Stopper(11), steps=30)[0])
+    resumed, later = texture_function("l1")(flat_task(tmp_path / "parts", steps=30)[0])
     assert torch.equal(whole, resumed)
     assert losses == later
 
 
 def test_a_stop_at_the_last_step_still_ends_the_run(tmp_path: Path) -> None:
-    texture, _ = METHODS["l1"](flat_task(tmp_path, Stopper(30), steps=30)[0])
+    texture, _ = texture_function("l1")(flat_task(tmp_path, Stopper(30), steps=30)[0])
     assert texture.isfinite().all()
 
 
@@ -274,11 +279,13 @@ def test_without_the_condition_the_discriminator_does_not_see_the_source(around:
 
 @pytest.mark.parametrize("name", ["adversarial", "adversarial_no_auxiliary", "adversarial_no_condition"])
 def test_the_ablations_run_and_differ(name: str, around: MethodInput) -> None:
-    texture, losses = METHODS[name](around)
+    texture, losses = texture_function(name)(around)
     assert texture.isfinite().all()
     assert losses[-1]["step"] == 3
     if name != "adversarial":
-        whole, _ = METHODS["adversarial"](replace(around, work=WorkFolder(around.work.path / "2", "", Monitor())))
+        whole, _ = texture_function("adversarial")(
+            replace(around, work=WorkFolder(around.work.path / "2", "", Monitor()))
+        )
         assert not torch.equal(texture, whole)
 
 
@@ -288,7 +295,7 @@ def test_a_rate_may_be_in_units_of_the_views_disagreement(around: MethodInput, t
     for unit, size in units.items():
         preset = replace(around.preset, start="mean", lr_texture=2e-3, lr_unit=unit)
         given = replace(around, preset=preset, work=WorkFolder(tmp_path / unit, "", Monitor()))
-        METHODS["adversarial"](given)
+        texture_function("adversarial")(given)
         assert given.facts["step"]["lr_texture"] == pytest.approx(2e-3 * size)
 
 
@@ -319,7 +326,7 @@ def test_vgg_comes_nearer_in_features_and_in_colors(around: MethodInput, monkeyp
     monkeypatch.setattr(descent, "LR", 1e-2)
     gray = torch.full_like(around.means[1], 0.5)
     preset = replace(around.preset, levels=(PyramidLevel(15),))
-    texture, losses = METHODS["vgg"](replace(around, means={1: gray}, preset=preset))
+    texture, losses = texture_function("vgg")(replace(around, means={1: gray}, preset=preset))
     assert losses[-1]["vgg"] < 0.9 * losses[0]["vgg"]
     seen = around.maps[1].slot_map >= 0
     before, after = ((start - truth())[seen].abs().mean() for start in (gray, texture))
@@ -338,7 +345,7 @@ def test_vgg_without_weights_says_what_is_missing(
 ) -> None:
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path))
     with pytest.raises(WeightsError, match=r"no weights: .* has no file vgg16-\*\.pth"):
-        METHODS["vgg"](around)
+        texture_function("vgg")(around)
     with pytest.raises(WeightsError, match="no weights"):
         texture_scan(tmp_path, tmp_path / "out", TextureConfig(method="vgg"), work=tmp_path / "work")
     assert not (tmp_path / "out").exists(), "it is said before anything is done"

@@ -16,7 +16,7 @@ from wavy_sheet import HEIGHT, WIDTH, camera_over, paint, sheet
 from advtex_engine.core.config import PRESETS, TextureConfig
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Atlas, Camera, Mesh, Scene, View
-from advtex_engine.methods import METHODS, MethodInput
+from advtex_engine.methods import MethodInput, texture_function
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.previews.live import Live
 from advtex_engine.refine.points import Observations
@@ -222,7 +222,7 @@ def test_with_wrong_geometry_colormap_is_closer_to_the_truth_than_the_mean(exact
         WorkFolder(tmp_path, "", monitor),
         Live(scene, atlas, monitor),
     )
-    texture, _ = METHODS["colormap"](given)
+    texture, _ = texture_function("colormap")(given)
     side = (torch.arange(SIDE) + 0.5) / SIDE * 4 - 2
     truth = paint(torch.stack(torch.meshgrid(side, side, indexing="xy"), -1))
     inner = slice(SIDE // 3, -SIDE // 3)

@@ -14,7 +14,7 @@ from torch import Tensor
 from advtex_engine.core.config import PRESETS, TextureConfig
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Atlas, Camera, Mesh, Scene, View
-from advtex_engine.methods import METHODS, MethodInput
+from advtex_engine.methods import MethodInput, texture_function
 from advtex_engine.methods.view_selection import Selection, select_views, view_selection
 from advtex_engine.metrics.image_metrics import gradient_ratio
 from advtex_engine.pipeline import texture_scan
@@ -22,7 +22,7 @@ from advtex_engine.previews.live import Live
 from advtex_engine.render.render_view import render_layers, render_view
 from advtex_engine.render.view_maps import build_view_maps
 from advtex_engine.runtime.checkpoint import WorkFolder
-from advtex_options.words import METHOD_HELP
+from advtex_options.methods import METHOD_HELP
 
 DATA = Path(os.environ.get("ADVTEX_DATA", Path(__file__).parents[3] / "../shared/data"))
 SIDE, CELLS = 128, 10
@@ -85,7 +85,7 @@ def error(selection: Selection) -> float:
 
 
 def test_the_method_is_registered() -> None:
-    assert METHODS["view_selection"] is view_selection
+    assert texture_function("view_selection") is view_selection
     assert "view_selection" in METHOD_HELP
 
 

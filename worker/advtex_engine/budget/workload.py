@@ -8,12 +8,14 @@ allocator, as the bytes alive at the fullest moment of a step.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from advtex_engine.adversarial.optimizer import crop_size
 from advtex_engine.core.config import Preset
 from advtex_engine.render.view_maps import BYTES_PER_PIXEL
 from advtex_engine.runtime.available_memory import CONTEXT
+from advtex_options.methods import known_methods
 
 FLOAT = 4
 TEXEL = 3 * FLOAT  # of a texture, three channels
@@ -32,8 +34,6 @@ CONVOLUTIONS = 360  # per pixel of the crop: what oneDNN keeps by itself, on a C
 LIBRARIES = 174 << 20  # on a CPU: code, tables and threads of what steps are the first to use; 158 to 197 were seen
 FILLING = 79  # per texel of a dense texture that is made from a compact one
 SPLATTING = 240  # per pixel of a view that is averaged into the mean texture
-VGG_PIXEL = 10_000  # per pixel of the crop of its features' network, both examples
-VGG_CROP = 128
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,12 @@ class Workload:
     @property
     def draws_pairs(self) -> bool:
         """Whether the method has a step that draws a pair of views, and can do with a part of them at a time."""
-        return self.plays or self.method == "vgg"
+        return known_methods()[self.method].draws_pairs
 
     @property
     def plays(self) -> bool:
         """Whether there is a discriminator."""
-        return self.method.startswith("adversarial")
+        return known_methods()[self.method].plays_game
 
     @property
     def crop(self) -> tuple[int, int]:
@@ -119,13 +119,15 @@ def activations(width: int, height: int, size: int) -> list[int]:
 
 
 def _step(work: Workload) -> dict[str, int]:
-    if work.method == "vgg":
-        pixels = min(VGG_CROP, work.width) * min(VGG_CROP, work.height)
-        return {"compact_texture": 4 * TEXEL * work.slots, "activations": VGG_PIXEL * pixels, "step": 0}
-    if work.method == "l1":  # spread over four texels per pixel, with their indices and weights
-        return {"compact_texture": 5 * TEXEL * work.slots, "activations": 0, "step": 200 * work.width * work.height}
     if not work.plays:
-        return {"compact_texture": 2 * TEXEL * work.slots, "activations": 0, "step": 0}
+        memory = known_methods()[work.method].memory
+        seen = (side if memory.crop is None else min(side, memory.crop) for side in (work.width, work.height))
+        pixels = math.prod(seen)
+        return {
+            "compact_texture": memory.textures * TEXEL * work.slots,
+            "activations": memory.network * pixels,
+            "step": memory.rest * pixels,
+        }
     preset, (width, height) = work.preset, work.crop
     # Value, gradient and two moments.
     beside = (preset.l1_target == "start") + bool(preset.averaging)

@@ -11,6 +11,7 @@ from typing import Literal
 
 from advtex_engine.core.errors import OptionError
 from advtex_options import Options, described, refusal
+from advtex_options.methods import known_methods
 from advtex_options.options import FACE_BUDGET, MAX_VIEWS
 
 
@@ -176,8 +177,8 @@ class TextureConfig(Options):
 
     @property
     def refines(self) -> bool:
-        """Whether cameras and exposures are refined first; the method colormap is nothing without."""
-        return self.method == "colormap" or (self.refine and self.preset != "paper")
+        """Whether cameras and exposures are refined first; some methods are nothing without."""
+        return known_methods()[self.method].refines_cameras or (self.refine and self.preset != "paper")
 
     def __post_init__(self) -> None:
         for name in described():

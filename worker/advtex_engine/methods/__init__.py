@@ -1,40 +1,43 @@
-"""Texturing methods behind one signature: `Method`, from the view maps to a dense texture."""
+"""Texturing methods behind one signature, `TextureFunction`: from the view maps to a dense texture.
+
+Each is told of by its record in `advtex_options.methods`, which names its function here or in another package.
+"""
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
+from typing import Any
 
 from torch import Tensor
 
-from advtex_engine.methods.adversarial import adversarial, adversarial_no_auxiliary, adversarial_no_condition
-from advtex_engine.methods.best_view import best_view
-from advtex_engine.methods.colormap import colormap
+from advtex_engine.core.errors import EngineError
 from advtex_engine.methods.inputs import LossPoint, MethodInput
-from advtex_engine.methods.l1 import l1
-from advtex_engine.methods.mean import mean
-from advtex_engine.methods.sharpest import sharpest
-from advtex_engine.methods.vgg import load_vgg, vgg
-from advtex_engine.methods.view_selection import view_selection
+from advtex_options.methods import known_methods
 
-Method = Callable[[MethodInput], tuple[Tensor, list[LossPoint]]]
+TextureFunction = Callable[[MethodInput], tuple[Tensor, list[LossPoint]]]
 
-METHODS: dict[str, Method] = {
-    "adversarial": adversarial,
-    "adversarial_no_auxiliary": adversarial_no_auxiliary,
-    "adversarial_no_condition": adversarial_no_condition,
-    "best_view": best_view,
-    "colormap": colormap,
-    "l1": l1,
-    "mean": mean,
-    "sharpest": sharpest,
-    "vgg": vgg,
-    "view_selection": view_selection,
-}
+__all__ = ["LossPoint", "MethodInput", "TextureFunction", "require", "texture_function"]
 
-__all__ = ["METHODS", "LossPoint", "Method", "MethodInput", "require"]
+
+def texture_function(method: str) -> TextureFunction:
+    """The function of a method that is known. Raises EngineError if its package does not hold it."""
+    function: TextureFunction = _imported(method, known_methods()[method].function)
+    return function
 
 
 def require(method: str) -> None:
-    """Raises what the method would fail with for lack of weights, before a run has cost anything."""
-    if method == "vgg":
-        load_vgg()
+    """Raises what the method would fail with for lack of its function or weights, before a run has cost anything."""
+    texture_function(method)
+    if weights := known_methods()[method].weights:
+        _imported(method, weights)()
+
+
+def _imported(method: str, place: str) -> Any:
+    module, _, function = place.partition(":")
+    try:
+        return getattr(importlib.import_module(module), function)
+    except Exception as error:  # whatever a package of others does
+        told = f"{type(error).__name__}: {error}"
+        remedy = "update or reinstall the package that brings it, or choose another method"
+        raise EngineError(f"the method {method} cannot be used: {place} is not there ({told}); {remedy}") from error

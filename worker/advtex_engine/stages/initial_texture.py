@@ -1,4 +1,4 @@
-"""What the method begins with: mean textures, and for the adversarial ones the preset's start and tones."""
+"""What the method begins with: mean textures, and for those that play a game the preset's start and tones."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def method_input(
         live = Live(scene, atlas, monitor)
         given = MethodInput(scene, atlas, maps, means, preset, config, monitor, budget.texture_folder(), live)
         given = replace(given, on_device=budget.limits.on_device)
-        if config.method.startswith("adversarial"):
+        if work.plays:
             if preset.start == "selection":
                 given = replace(given, start=_selected_start(given))
             if preset.toned:

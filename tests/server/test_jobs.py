@@ -51,6 +51,14 @@ def test_a_bad_scan_is_rejected_with_every_finding(live: Any, is_error: Any) -> 
     is_error(live.http.post(f"/v1/jobs/{job.id}/retry"), 409, "conflict")
 
 
+def test_a_method_that_is_not_known_uses_no_idempotency_key_up(live: Any, is_error: Any) -> None:
+    spec, key = {"upload_id": live.upload(), "options": {"method": "magic"}}, {"Idempotency-Key": "once"}
+    refused = is_error(live.http.post("/v1/jobs", json=spec, headers=key), 422, "invalid_options")
+    assert "choose one of adversarial, " in refused
+    spec["options"] = {"method": "mean"}
+    assert live.http.post("/v1/jobs", json=spec, headers=key).json()["options"]["method"] == "mean"
+
+
 @pytest.mark.one_machine("pure validation")
 def test_options_out_of_bounds(live: Any, is_error: Any) -> None:
     upload = live.upload()

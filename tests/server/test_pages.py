@@ -16,10 +16,12 @@ import httpx
 import pytest
 
 from advtex_contract.jobs import RETRYABLE, STATES, TERMINAL
+from advtex_contract.options import JobOptions
 from advtex_contract.stages import STAGE_LABELS
 from advtex_server import static_files
 from advtex_server.authentication import KNOWN_SECONDS
 from advtex_server.browsers import HEADERS
+from advtex_store.models import JobRow
 
 pytestmark = pytest.mark.one_machine("the page asks what tests/store has on both databases")
 FIRST_PAGE_BYTES = 100_000
@@ -227,6 +229,17 @@ def test_lists_are_filtered_and_paged(live: Any, browser: httpx.Client) -> None:
     assert {batch["id"]: batch["jobs"] for batch in data_of(first)["batches"]} == {"night": 17, "day": 18}
 
 
+def test_a_job_whose_method_is_known_elsewhere_only_is_shown(live: Any, browser: httpx.Client) -> None:
+    job = live.job(live.upload())["id"]
+    with live.store.database.write() as session:
+        row = session.get(JobRow, job)
+        row.options = row.options | {"method": "from_elsewhere"}
+    (listed,) = data_of(browser.get("/"))["jobs"]
+    (told,) = live.http.get("/v1/jobs").json()["jobs"]
+    assert listed["method"] == told["options"]["method"] == "from_elsewhere"
+    assert data_of(browser.get(f"/jobs/{job}"))["options"] == told["options"]
+
+
 def test_the_words_of_states_and_stages_are_the_contracts(browser: httpx.Client) -> None:
     page = browser.get("/").text
     found = re.search(r'<script type="application/json" id="words">(.*?)</script>', page)
@@ -237,6 +250,7 @@ def test_the_words_of_states_and_stages_are_the_contracts(browser: httpx.Client)
         s for s in STATES if s in TERMINAL
     ]
     assert {state for state, told in words["states"].items() if told["retryable"]} == RETRYABLE
+    assert words["usual_method"] == JobOptions().method
     for state, facts in STATES.items():
         assert words["states"][state]["label"] == facts.label
         assert f'<option value="{state}">{facts.label}</option>' in page
@@ -315,8 +329,6 @@ def _imports(script: str) -> list[str]:
 def _multiply_jobs(live: Any, count: int) -> None:
     """Copies of the newest job."""
     from sqlalchemy import insert, select
-
-    from advtex_store.models import JobRow
 
     table = JobRow.__table__
     with live.store.database.write() as session:

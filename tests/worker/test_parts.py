@@ -84,6 +84,11 @@ def test_engine_and_contract_refuse_in_the_same_words(name: str) -> None:
         assert str(refused.value) == str(told.value)
 
 
+def test_a_method_that_this_worker_lacks_is_refused_with_the_remedy() -> None:
+    with pytest.raises(OptionError, match=r"method 'magic' is unknown; .*, or install the package that brings it"):
+        texture_config(JobOptions(method="magic"), "cpu")
+
+
 @given(
     st.sampled_from(Preset),
     st.sampled_from(sorted(known_methods())),

@@ -14,11 +14,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from advtex_engine import methods
 from advtex_engine.adversarial.disagreement import disagreement
 from advtex_engine.adversarial.discriminator import PatchDiscriminator
 from advtex_engine.adversarial.optimizer import AdversarialOptimizer
 from advtex_engine.core.config import PRINTED, PyramidLevel, TextureConfig
-from advtex_engine.core.errors import Stopped
+from advtex_engine.core.errors import EngineError, Stopped
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Atlas, Camera, Mesh, Scene, View
 from advtex_engine.methods import MethodInput, descent, texture_function
@@ -37,7 +38,7 @@ from advtex_engine.render.view_maps import build_view_maps
 from advtex_engine.runtime.checkpoint import WorkFolder
 from advtex_engine.synthetic.object import look_at
 from advtex_engine.synthetic.planar import planar_maps
-from advtex_options.methods import BUILT_IN, Method
+from advtex_options.methods import BUILT_IN, Method, known_methods
 
 SIDE, CELLS = 96, 8  # texels of the plane's side, and its quads
 WIDTH, HEIGHT = 96, 80
@@ -110,6 +111,17 @@ def test_what_a_record_names_is_there(method: Method) -> None:
         module, _, function = place.partition(":")
         assert module.startswith("advtex_engine.methods.")
         assert callable(getattr(importlib.import_module(module), function))
+
+
+def test_a_method_whose_function_is_gone_is_told_before_anything_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gone = replace(known_methods()["mean"], function="no_such_package:mean")
+    monkeypatch.setattr(methods, "known_methods", lambda: {"mean": gone})
+    words = "the method mean cannot be used: no_such_package:mean is not there .*; update or reinstall the package"
+    with pytest.raises(EngineError, match=words):
+        texture_scan(tmp_path, tmp_path / "out", TextureConfig(method="mean"), work=tmp_path / "work")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("name", ["mean", "l1", "best_view", "sharpest"])

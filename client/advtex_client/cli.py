@@ -34,9 +34,8 @@ from advtex_client.deep import deep_lines, deep_report
 from advtex_client.doctor import examine
 from advtex_client.errors import ScanRejectedError
 from advtex_contract.jobs import RETRYABLE, TERMINAL, JobState, JobView
-from advtex_options.flags import LayoutFlag, option_flags
+from advtex_options.flags import LayoutFlag, option_flags, version_flag
 from advtex_scan.check import check_scan
-from advtex_scan.version import product_version
 
 app = typer.Typer(
     help="Texture RGB-D scans on an advtex server.",
@@ -48,17 +47,9 @@ app = typer.Typer(
 app.add_typer(cli_batch.app, name="batch")
 
 
-def _print_version(asked: bool) -> None:
-    if asked:
-        typer.echo(f"advtex-client {product_version()}")
-        raise typer.Exit
-
-
 @app.callback()
 def advtex_client(
-    _version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and exit")
-    ] = False,
+    _version: Annotated[bool, version_flag("advtex-client")] = False,
 ) -> None:
     """What all commands have in common."""
 

@@ -1,4 +1,4 @@
-"""The options as flags of a command line, the same for every command that has them."""
+"""Flags of a command line, the same for every command that has them: the options, and the version."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Annotated, Any, TypeVar
 import typer
 
 from advtex_options.options import described, kind_of, refusal
+from advtex_scan.version import product_version
 
 T = TypeVar("T")
 
@@ -54,6 +55,17 @@ def flag(name: str, **more: Any) -> Any:
     return typer.Option(
         f"--{name.replace('_', '-')}", metavar=metavar, help=". ".join(words), show_default=about.unset, **more
     )
+
+
+def version_flag(program: str) -> Any:
+    """The flag `--version` of a program, for an annotation: prints its name and version, and ends it."""
+
+    def printed(asked: bool) -> None:
+        if asked:
+            typer.echo(f"{program} {product_version()}")
+            raise typer.Exit
+
+    return typer.Option("--version", callback=printed, is_eager=True, help="print the version and exit")
 
 
 LayoutFlag = Annotated[str | None, flag("layout", callback=layout_of)]

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from advtex_scan.version import product_version
+from advtex_options.flags import version_flag
 from advtex_server.embedded import SetupError
 from advtex_server.health import checks
 from advtex_server.serving import serve as run_server
@@ -38,17 +38,9 @@ app.add_typer(keys, name="keys")
 NAMED = 5  # of each kind of what is wrong
 
 
-def _print_version(asked: bool) -> None:
-    if asked:
-        typer.echo(f"advtex-server {product_version()}")
-        raise typer.Exit
-
-
 @app.callback()
 def advtex_server(
-    _version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and exit")
-    ] = False,
+    _version: Annotated[bool, version_flag("advtex-server")] = False,
 ) -> None:
     """What all commands have in common."""
 

@@ -17,8 +17,7 @@ from advtex_engine.core.config import PRESETS, TextureConfig
 from advtex_engine.core.errors import EngineError, OptionError, Problem, Stopped
 from advtex_engine.core.monitor import Monitor
 from advtex_options import parse_size
-from advtex_options.flags import LayoutFlag, option_flags
-from advtex_scan.version import product_version
+from advtex_options.flags import LayoutFlag, option_flags, version_flag
 
 
 class _Printer(Monitor):
@@ -84,17 +83,9 @@ HOLDOUT = "only the sorted frames whose position % N == N // 2"
 SIZE = "size of renders and photographs"
 
 
-def _print_version(asked: bool) -> None:
-    if asked:
-        typer.echo(f"advtex-engine {product_version()}")
-        raise typer.Exit
-
-
 @app.callback()
 def advtex_engine(
-    _version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and exit")
-    ] = False,
+    _version: Annotated[bool, version_flag("advtex-engine")] = False,
 ) -> None:
     """The engine alone, without a service."""
 

@@ -41,7 +41,7 @@ class Superseded(StoreError):
 
 
 class NotUnderstood(StoreError):
-    """The job's options say what this release does not know."""
+    """The job's options say what this release does not know, or name a method that is not installed here."""
 
 
 class IdempotencyMismatch(StoreError):

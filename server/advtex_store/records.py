@@ -54,7 +54,7 @@ from advtex_store.webhooks import tell_webhooks
 
 S = JobState
 POISON_DEATHS = 3
-DECLINED = "a worker of another release does not understand its options, upgrade the workers: "
+DECLINED = "a worker does not understand its options, upgrade it or install the package of the method: "
 EXPLAINED = 1000  # waiting rows that are told in one go why they wait
 
 
@@ -119,7 +119,7 @@ class Records:
             )
 
     def decline(self, job_id: str, attempt: int, reason: str) -> None:
-        """Leave a waiting job to a worker of another release, and tell why it waits; its attempt is still to come."""
+        """Leave a waiting job to another worker, and tell why it waits; its attempt is still to come."""
         told = f"{DECLINED}{reason}"[:255]
         mine = and_(JobRow.id == job_id, JobRow.attempt == attempt, JobRow.state.in_(WAITING))
         with self.database.write() as session:

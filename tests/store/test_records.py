@@ -319,7 +319,10 @@ def test_any_history_is_legal(sqlite_bench: Any, data: st.DataObject) -> None:
         before = after
 
 
-@pytest.mark.parametrize("unknown", [{"sharpen": 2}, {"preset": "ultra"}, {"layout": "hologram"}, {"seed": "one"}])
+@pytest.mark.parametrize(
+    "unknown",
+    [{"sharpen": 2}, {"preset": "ultra"}, {"method": "carving"}, {"layout": "hologram"}, {"seed": "one"}],
+)
 def test_a_job_of_another_release_is_left_to_it(bench: Any, unknown: dict[str, object]) -> None:
     job = bench.job()
     known = bench.records.job(job).options

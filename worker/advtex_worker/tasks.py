@@ -74,7 +74,7 @@ def run_attempt(host: Host, job_id: str, attempt: int) -> None:
     except (StaleAttempt, RecordNotFound) as reason:
         log.info("nothing to do", job=job_id, attempt=attempt, reason=str(reason))
     except NotUnderstood as reason:
-        log.warning("declined a job of another release", job=job_id, attempt=attempt, reason=str(reason))
+        log.warning("declined a job that is not understood here", job=job_id, attempt=attempt, reason=str(reason))
         store.records.decline(job_id, attempt, str(reason))
         store.queue.decline(job_id, attempt)
     else:

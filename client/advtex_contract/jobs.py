@@ -8,10 +8,11 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints, model_validator
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
 from advtex_contract.errors import ErrorDetail
 from advtex_contract.options import JobOptions
+from advtex_contract.stored_options import AnyOptions
 
 Label = Annotated[str, StringConstraints(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
 
@@ -169,13 +170,6 @@ class JobError(BaseModel):
     log_tail: str = ""
 
 
-def known_options(stored: object) -> object:
-    """Return options as they were stored, without those that only another version knows."""
-    if not isinstance(stored, Mapping):
-        return stored
-    return {name: value for name, value in stored.items() if name in JobOptions.model_fields}
-
-
 class JobView(BaseModel):
     """A job as the API shows it.
 
@@ -192,7 +186,7 @@ class JobView(BaseModel):
     upload_id: str
     source: str | None = None
     batch: str | None = None
-    options: Annotated[JobOptions, BeforeValidator(known_options)]
+    options: AnyOptions
     priority: int = 0
     attempt: int = 0
     waiting_reason: str = ""

@@ -116,12 +116,21 @@ def chosen_options(given: Mapping[str, Any], usual: JobOptions | None = None) ->
         raise ValueError(told if name in told else f"options.{name}: {told}") from error
 
 
+def known_options(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Stored options without those that only another version knows."""
+    return {name: value for name, value in stored.items() if name in JobOptions.model_fields}
+
+
 def misunderstood(stored: Mapping[str, Any]) -> str | None:
-    """What stored options say that this version does not know, in a sentence; None where it knows all of it."""
-    if unknown := sorted(stored.keys() - JobOptions.model_fields.keys()):
+    """What stored options say that this version does not know, in a sentence; None where it knows all of it.
+
+    Null under a name that it does not know is an option that was not given, and asks for nothing.
+    """
+    unknown = sorted(name for name in stored.keys() - JobOptions.model_fields.keys() if stored[name] is not None)
+    if unknown:
         return f"there is no option {', '.join(unknown)}"
     try:
-        chosen_options(stored)
+        chosen_options(known_options(stored))
     except ValueError as error:
         return str(error)
     return None

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.concurrency import run_in_threadpool
 
-from advtex_contract.options import Preset
+from advtex_options import Options
 from advtex_server.events import PING_SECONDS
 from advtex_store.models import JobRow
 from advtex_store.overviews import Overviews
@@ -28,7 +28,7 @@ class JobSummary(BaseModel):
     state: str
     label: str
     batch: str | None
-    preset: Preset
+    preset: str
     method: str
     stage: str
     step: int
@@ -49,8 +49,8 @@ def job_summary(row: JobRow) -> JobSummary:
         state=row.state,
         label=row.label,
         batch=row.batch,
-        preset=row.options["preset"],
-        method=row.options["method"],
+        preset=str(row.options.get("preset", Options.preset)),
+        method=str(row.options.get("method", Options.method)),
         stage=progress.get("stage", ""),
         step=progress.get("step", 0),
         steps=progress.get("steps", 0),

@@ -22,10 +22,9 @@ from advtex_contract.jobs import (
     Progress,
     ResultFile,
     StorageInfo,
-    known_options,
 )
 from advtex_contract.live import LiveImage, LiveRecord, LiveView
-from advtex_contract.options import JobOptions
+from advtex_contract.stored_options import read_options
 from advtex_options import refusal
 from advtex_server.batches import BatchService
 from advtex_server.older_clients import told
@@ -207,7 +206,7 @@ def job_view(row: JobRow) -> JobView:
         upload_id=row.upload_id,
         source=row.source,
         batch=row.batch,
-        options=JobOptions.model_validate(known_options(row.options)),
+        options=read_options(row.options),
         priority=row.priority,
         attempt=row.attempt - 1 if state in WAITING else row.attempt,
         waiting_reason=row.waiting_reason or REASONS.get(state, "") if state not in TERMINAL else "",

@@ -18,8 +18,8 @@ from sqlalchemy import ColumnElement, func, or_, select
 from sqlalchemy.orm import Session
 
 from advtex_contract.errors import ErrorDetail
-from advtex_contract.jobs import JobError, JobState, known_options
-from advtex_contract.options import JobOptions
+from advtex_contract.jobs import JobError, JobState
+from advtex_contract.options import JobOptions, known_options, misunderstood
 from advtex_store import keys
 from advtex_store.errors import StaleAttempt
 from advtex_store.models import JobRow
@@ -27,6 +27,8 @@ from advtex_store.records import Records
 
 S = JobState
 DEATHS = 3
+DECLINED = "a server of another release does not understand its options, upgrade the servers: "
+DECLINED_SECONDS = 10.0  # until such a job is looked at again, perhaps by a server that understands it
 REMEDY = "make the scan smaller (fewer faces, fewer files), or retry the job on a machine with more memory"
 
 
@@ -53,7 +55,7 @@ class Checks:
 
     def claim(self) -> CheckClaim | None:
         """Take a job that nobody checks, None if there is none. Of all owners that have one, chance chooses: a large
-        batch keeps nobody waiting."""
+        batch keeps nobody waiting. A job with options that only another release knows is left to that."""
         with self.database.read() as session:
             free = _free(self.database.now(session))
             oldest = list(session.scalars(select(func.min(JobRow.id)).where(*free).group_by(JobRow.owner)))
@@ -63,7 +65,9 @@ class Checks:
                 now = self.database.now(session)
                 query = select(JobRow).where(JobRow.id == job_id, *_free(now)).with_for_update(skip_locked=True)
                 row = session.scalar(query)
-                if row is not None and (row.worker is None or self._died(session, row, "its server was killed")):
+                if row is not None and (reason := misunderstood(row.options)) is not None:
+                    _put_off(row, DECLINED + reason, now, DECLINED_SECONDS)
+                elif row is not None and (row.worker is None or self._died(session, row, "its server was killed")):
                     row.worker, row.lease_expires_at = secrets.token_hex(8), now + self.lease_seconds
                     return _claim(row)
         return None
@@ -116,9 +120,7 @@ class Checks:
         with self.database.write() as session:
             row = self._held(session, claim)
             if error is None or self._counted(session, row, error):
-                now = self.database.now(session)
-                row.worker, row.lease_expires_at = None, now + seconds
-                row.waiting_reason, row.updated_at, row.version = reason[:255], now, row.version + 1
+                _put_off(row, reason, self.database.now(session), seconds)
 
     def release(self, claim: CheckClaim) -> None:
         """The checker must go; another one begins anew."""
@@ -161,6 +163,12 @@ def _free(now: float) -> tuple[ColumnElement[bool], ...]:
     """Of rows that wait for a checker."""
     unheld = or_(JobRow.lease_expires_at.is_(None), JobRow.lease_expires_at < now)
     return JobRow.state == S.checking, JobRow.deleted_at.is_(None), unheld
+
+
+def _put_off(row: JobRow, reason: str, now: float, seconds: float) -> None:
+    row.worker, row.lease_expires_at = None, now + seconds
+    if reason[:255] != row.waiting_reason:
+        row.waiting_reason, row.updated_at, row.version = reason[:255], now, row.version + 1
 
 
 _LET_GO: dict[str, Any] = {"worker": None, "lease_expires_at": None, "deaths": 0, "waiting_reason": ""}

@@ -40,7 +40,7 @@ from sqlalchemy.orm import Session
 
 from advtex_contract.errors import ErrorDetail
 from advtex_contract.jobs import RETRYABLE, STATES, TERMINAL, WAITING, JobError, JobState, Progress
-from advtex_contract.options import JobOptions, misunderstood
+from advtex_contract.options import JobOptions, known_options, misunderstood
 from advtex_store import keys
 from advtex_store.accounts import check_active_jobs
 from advtex_store.counters import ATTEMPTS, count_end, count_one
@@ -113,7 +113,7 @@ class Records:
                 upload_id=row.upload_id,
                 scan_key=keys.scan_key(row.upload_id),
                 source=row.source,
-                options=JobOptions.model_validate(row.options),
+                options=JobOptions.model_validate(known_options(row.options)),
                 progress=Progress.model_validate(row.progress),
                 lease=Lease(expires_at, row.cancel_requested),
             )
@@ -316,7 +316,7 @@ class Records:
                 row.cancel_requested = True
                 row.version, row.updated_at = row.version + 1, self.database.now(session)
                 return row
-            begun = row.attempt - 1 if JobState(row.state) in WAITING else row.attempt
+            begun = row.attempt - 1 if row.state in WAITING else row.attempt
             return self.finish(session, self.move(session, job_id, S.canceled, attempt=begun))
 
     def retry(self, job_id: str, owner: str | None = None, *, max_active_jobs: int | None = None) -> JobRow:
@@ -327,13 +327,13 @@ class Records:
             ended = {"cancel_requested": False, "error": None, "finished_at": None, "expires_at": None, "deaths": 0}
             to = S.checking if row.checked_at is None else S.queued
             following = _released(row.attempt + (to is S.queued))
-            return self.move(session, job_id, to, sources=RETRYABLE, **ended, **following)
+            return self.move(session, job_id, to, sources=RETRYABLE, waiting_reason="", **ended, **following)
 
     def delete(self, job_id: str, owner: str | None = None) -> None:
         """Hide an ended job; its blobs follow (`purged`)."""
         with self.database.write() as session:
             row = self._get(session, job_id, owner, lock=True)
-            if JobState(row.state) not in TERMINAL:
+            if row.state not in TERMINAL:
                 raise IllegalTransition(f"job {job_id} is {row.state}: cancel it before deleting it")
             row.deleted_at = row.updated_at = self.database.now(session)
 

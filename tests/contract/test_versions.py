@@ -7,15 +7,17 @@ import json
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from pydantic import BaseModel, ValidationError
 
-from advtex_contract import errors, health, jobs, live, options, webhooks
+from advtex_contract import errors, health, jobs, live, options, stored_options, webhooks
 
 SENT = {jobs.JobSpec, options.JobOptions, webhooks.WebhookSpec}
 MODELS = sorted(
     {
         model
-        for module in (errors, health, jobs, live, options, webhooks)
+        for module in (errors, health, jobs, live, options, stored_options, webhooks)
         for _, model in inspect.getmembers(module, inspect.isclass)
         if issubclass(model, BaseModel) and model.__module__ == module.__name__ and not model.__name__.startswith("_")
     },
@@ -66,6 +68,29 @@ def test_a_job_of_an_older_version_is_read() -> None:
     view = jobs.JobView.model_validate(least | {"options": {}, "progress": {}})
     assert view.options == options.JobOptions()
     assert view.progress == jobs.Progress()
+
+
+ODD = st.sampled_from([None, True, -1, 1 << 40, 0.5, "", "ultra", [1], {"a": 1}])
+
+
+@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(st.dictionaries(st.sampled_from([*options.JobOptions.model_fields, "from_the_future"]), ODD))
+def test_options_of_any_version_are_read_as_they_are_and_sent_by_none_but_their_own(stored: dict[str, Any]) -> None:
+    view = jobs.JobView.model_validate(JOB | {"options": stored})
+    assert jobs.JobView.model_validate_json(view.model_dump_json()) == view
+    for name, value in options.known_options(stored).items():
+        assert getattr(view.options, name) == value
+    if options.misunderstood(stored) is None:
+        assert isinstance(view.options, options.JobOptions)
+    elif {"layout", "method", "from_the_future"}.isdisjoint(stored):  # the first two are open words
+        with pytest.raises(ValidationError):
+            jobs.JobSpec.model_validate({"upload_id": "u", "options": stored})
+
+
+def test_an_option_that_only_another_version_knows_does_no_harm_until_it_is_given() -> None:
+    stored = options.JobOptions().model_dump(mode="json") | {"from_the_future": None}
+    assert options.misunderstood(stored) is None
+    assert "from_the_future" in (options.misunderstood(stored | {"from_the_future": 0}) or "")
 
 
 def test_options_that_are_sent_are_refused_where_they_are_not_known() -> None:

@@ -421,3 +421,30 @@ def test_rows_of_a_newer_version_are_shown(live: Any) -> None:
     assert "from_the_future" not in shown.text
     assert [warning["message"] for warning in shown.json()["warnings"]] == ["m"]
     assert live.http.get("/v1/jobs").status_code == 200
+
+
+def test_words_that_only_a_newer_version_knows_are_shown(live: Any) -> None:
+    """In the job, its events, lists, the batch and the page; and what cannot be done to it is a conflict."""
+    job = live.job(live.upload(), batch="night")["id"]
+    words = {"preset": "ultra", "method": "splats", "max_texture_size": 1 << 20}
+    with live.store.database.write() as session:
+        row = session.get(JobRow, job)
+        row.state, row.options = "polishing", row.options | words
+        row.progress = row.progress | {"stage": "polish"}
+    shown = live.http.get(f"/v1/jobs/{job}").json()
+    assert (shown["state"], shown["progress"]["stage"]) == ("polishing", "polish")
+    assert words.items() <= shown["options"].items()
+    assert live.http.get("/v1/jobs").json()["jobs"] == [shown]
+    assert live.http.get("/v1/batches/night").json()["states"] == {"polishing": 1}
+    assert live.http.get("/v1/batches").json()["batches"][0]["states"] == {"polishing": 1}
+    with live.http.stream("GET", f"/v1/jobs/{job}/events") as events:
+        assert any('"polishing"' in line and '"ultra"' in line for line in events.iter_lines())
+    with live.client(None) as browser:
+        browser.post("/sign-in", data={"key": live.key}, headers={"Origin": live.url})
+        for path in ("/", f"/jobs/{job}"):
+            page = browser.get(path)
+            assert page.status_code == 200
+            assert job in page.text
+    assert live.http.get("/metrics").status_code == 200
+    assert live.http.post(f"/v1/jobs/{job}/cancel").status_code == 409
+    assert live.http.delete(f"/v1/jobs/{job}").status_code == 409

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from advtex_contract.errors import ErrorDetail
 from advtex_contract.jobs import STATES, TERMINAL, JobError, JobSpec, JobState
 from advtex_store.accounts import QuotaExceeded
-from advtex_store.checks import DEATHS, CheckClaim
+from advtex_store.checks import DEATHS, DECLINED, DECLINED_SECONDS, CheckClaim
 from advtex_store.errors import IllegalTransition, StaleAttempt
+from advtex_store.models import JobRow
 
 REJECTION = JobError(code="invalid_scan", message="no mesh")
 LEASE = 60
@@ -232,3 +233,24 @@ def test_every_order_of_events_has_one_outcome(sqlite_bench: Any, order: list[tu
         while (claim := bench.checks.claim()) is not None:
             bench.checks.rejected(claim, REJECTION)
     assert bench.records.job(job).state != "checking"
+
+
+@pytest.mark.parametrize("unknown", [{"sharpen": 2}, {"preset": "ultra"}, {"layout": "hologram"}])
+def test_a_job_of_another_release_is_left_to_a_server_of_it(bench: Any, unknown: dict[str, object]) -> None:
+    job, other = submitted(bench), submitted(bench, "other")
+    known = bench.records.job(job).options
+    edit(bench, job, known | unknown)
+    claims = [bench.checks.claim() for _ in range(3)]
+    assert [claim.job_id for claim in claims if claim is not None] == [other]
+    row = bench.records.job(job)
+    assert (row.state, row.worker, row.deaths) == ("checking", None, 0)
+    assert row.waiting_reason.startswith(DECLINED)
+    assert next(iter(unknown)) in row.waiting_reason
+    edit(bench, job, known)  # as a newer server sees it
+    bench.clock.now += DECLINED_SECONDS + 1
+    assert bench.checks.claim().job_id == job
+
+
+def edit(bench: Any, job: str, options: dict[str, Any]) -> None:
+    with bench.database.write() as session:
+        session.get(JobRow, job).options = options

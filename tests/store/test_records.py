@@ -351,6 +351,21 @@ def test_what_runs_meanwhile_is_not_declined(bench: Any) -> None:
     assert (row.state, row.waiting_reason, row.version) == ("running", "", version)
 
 
+def test_a_retry_begins_without_the_reason_of_before(bench: Any) -> None:
+    job = bench.job()
+    bench.records.decline(job, 1, "there is no option sharpen")
+    bench.records.cancel(job)
+    assert bench.records.retry(job).waiting_reason == ""
+
+
+def test_a_state_that_only_another_release_knows_is_left_to_it(bench: Any) -> None:
+    job = bench.job()
+    edit(bench, job, state="polishing")
+    for change in (bench.records.cancel, bench.records.retry, bench.records.delete):
+        with pytest.raises(IllegalTransition, match="polishing"):
+            change(job)
+
+
 def edit(bench: Any, job_id: str, **values: object) -> None:
     with bench.database.write() as session:
         session.execute(update(JobRow).where(JobRow.id == job_id).values(**values))

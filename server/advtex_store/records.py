@@ -35,22 +35,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, and_, func, select, update
-from sqlalchemy.orm import Session
+from sqlalchemy import and_, func, select, update
 
 from advtex_contract.errors import ErrorDetail
-from advtex_contract.jobs import RETRYABLE, STATES, TERMINAL, WAITING, JobError, JobState, Progress
+from advtex_contract.jobs import RETRYABLE, TERMINAL, WAITING, JobError, JobState, Progress
 from advtex_contract.options import JobOptions, known_options, misunderstood
 from advtex_store import keys
 from advtex_store.accounts import check_active_jobs
-from advtex_store.counters import ATTEMPTS, count_end, count_one
+from advtex_store.counters import ATTEMPTS, count_one
 from advtex_store.database import Database
-from advtex_store.errors import IllegalTransition, NotUnderstood, RecordNotFound, StaleAttempt
+from advtex_store.errors import IllegalTransition, NotUnderstood, StaleAttempt
 from advtex_store.fair_queue import WaitingJob, distinct_pairs, next_jobs, use_order_of_index
 from advtex_store.memory_estimate import GIB
 from advtex_store.models import KEPT, WAITS_FOR_A_REASON, EventRow, JobRow
+from advtex_store.transitions import Transitions, held, record_event
 from advtex_store.troubles import ADOPT, not_aside
-from advtex_store.webhooks import tell_webhooks
 
 S = JobState
 POISON_DEATHS = 3
@@ -81,11 +80,11 @@ class Claim:
     lease: Lease
 
 
-class Records:
-    """Jobs in the database. Every change of state is one compare-and-set."""
+class Records(Transitions):
+    """Jobs in the database, for workers, dispatcher and users."""
 
     def __init__(self, database: Database, *, lease_seconds: float = 60.0) -> None:
-        self.database = database
+        super().__init__(database)
         self.lease_seconds = lease_seconds
 
     # -- worker ---------------------------------------------------------------------------------------------------
@@ -129,7 +128,7 @@ class Records:
     def lease(self, job_id: str, attempt: int) -> Lease:
         """The lease as it is, without a commit. StaleAttempt: it is lost."""
         with self.database.read() as session:
-            query = select(JobRow.lease_expires_at, JobRow.cancel_requested).where(_held(job_id, attempt))
+            query = select(JobRow.lease_expires_at, JobRow.cancel_requested).where(held(job_id, attempt))
             found = session.execute(query).one_or_none()
             if found is None:
                 raise StaleAttempt(self._why_stale(session, job_id, attempt))
@@ -170,7 +169,7 @@ class Records:
                 stage_changed = told.stage != row.progress.get("stage")
                 row.progress, row.updated_at, row.version = data, now, row.version + 1
                 if stage_changed:
-                    _record(session, row, "progress", {name: data[name] for name in data if name != "notes"})
+                    record_event(session, row, "progress", {name: data[name] for name in data if name != "notes"})
             return Lease(row.lease_expires_at, row.cancel_requested)
 
     def succeed(
@@ -346,75 +345,6 @@ class Records:
                 session, self.move(session, job_id, to, sources=frozenset({S.running}), fence=attempt, error=data)
             )
 
-    def _get(self, session: Session, job_id: str, owner: str | None, *, lock: bool = False) -> JobRow:
-        query = select(JobRow).where(JobRow.id == job_id, JobRow.deleted_at.is_(None))
-        if owner is not None:
-            query = query.where(JobRow.owner == owner)
-        row = session.scalar(query.with_for_update() if lock else query)
-        if row is None:
-            raise RecordNotFound(f"there is no job {job_id}")
-        return row
-
-    def _running(self, session: Session, job_id: str, attempt: int) -> JobRow:
-        row = session.scalar(select(JobRow).where(_held(job_id, attempt)).with_for_update())
-        if row is None:
-            raise StaleAttempt(self._why_stale(session, job_id, attempt))
-        return row
-
-    def move(
-        self,
-        session: Session,
-        job_id: str,
-        to: JobState,
-        *,
-        fence: int | None = None,
-        sources: frozenset[JobState] | None = None,
-        **values: Any,
-    ) -> JobRow:
-        """Compare-and-set along `STATES`. `fence`: only if this is the job's attempt; `sources`: only from these."""
-        allowed = {state for state, facts in STATES.items() if to in facts.becomes}
-        where = [JobRow.id == job_id, JobRow.deleted_at.is_(None), JobRow.state.in_(allowed & (sources or allowed))]
-        if fence is not None:
-            where.append(JobRow.attempt == fence)
-        session.flush()
-        now = self.database.now(session)
-        statement = update(JobRow).where(*where).values(state=to, version=JobRow.version + 1, updated_at=now, **values)
-        row: JobRow | None = session.scalar(
-            statement.returning(JobRow), execution_options={"populate_existing": True, "synchronize_session": False}
-        )
-        if row is None and fence is not None:
-            raise StaleAttempt(self._why_stale(session, job_id, fence))
-        if row is None:
-            raise IllegalTransition(f"job {job_id} is {self._get(session, job_id, None).state}, it cannot become {to}")
-        _record(session, row, "state", {"state": to.value, "attempt": row.attempt, "at": now})
-        tell_webhooks(session, row, now)
-        return row
-
-    def finish(self, session: Session, row: JobRow, **values: Any) -> JobRow:
-        """What is due when a job has moved to a state that ends it."""
-        row.finished_at = self.database.now(session)
-        row.expires_at = row.finished_at + row.retention_seconds
-        row.lease_expires_at = None
-        row.cancel_requested = False
-        for name, value in values.items():
-            setattr(row, name, value)
-        count_end(session, row.state, row.error, row.progress.get("stage_seconds", {}))
-        return row
-
-    def _why_stale(self, session: Session, job_id: str, attempt: int) -> str:
-        row = session.get(JobRow, job_id)
-        if row is None:
-            return f"there is no job {job_id}"
-        return f"attempt {attempt} of job {job_id} is stale: the job is {row.state} at attempt {row.attempt}"
-
-
-def _held(job_id: str, attempt: int) -> ColumnElement[bool]:
-    return and_(JobRow.id == job_id, JobRow.state == S.running, JobRow.attempt == attempt, JobRow.deleted_at.is_(None))
-
 
 def _released(next_attempt: int) -> dict[str, Any]:
     return {"attempt": next_attempt, "worker": None, "lease_expires_at": None}
-
-
-def _record(session: Session, row: JobRow, kind: str, data: Mapping[str, Any]) -> None:
-    session.add(EventRow(job_id=row.id, version=row.version, data={"kind": kind, **data}))

@@ -170,10 +170,14 @@ def evaluate(
     refine_heldout: Annotated[
         bool, typer.Option("--refine-heldout", help="refine the frames' poses against the model first, and say so")
     ] = False,
+    budget: Annotated[
+        bool, typer.Option("--budget", help="split LPIPS into what pose, tone, displacement and content cost")
+    ] = False,
     json_: Annotated[Path | None, typer.Option("--json", help="write the scores per view and their means")] = None,
     contact_sheet: Annotated[Path | None, typer.Option(help="write a PNG: photograph, render, difference")] = None,
 ) -> None:
     """Score a textured model against a scan's photographs."""
+    from advtex_engine.metrics.budget import TABLE, format_budget
     from advtex_engine.metrics.evaluate import evaluate, write_json
     from advtex_engine.metrics.lpips import LPIPS_SOURCES, download, weights_folder
 
@@ -188,12 +192,20 @@ def evaluate(
     if download_weights:
         download(LPIPS_SOURCES, weights_folder(lpips_weights))
     evaluation = evaluate(
-        **given, weights=lpips_weights, sheet=contact_sheet, refine_poses=refine_heldout, monitor=_Printer()
+        **given,
+        weights=lpips_weights,
+        sheet=contact_sheet,
+        refine_poses=refine_heldout,
+        budget=budget,
+        monitor=_Printer(),
     )
     if json_ is not None:
         write_json(json_, evaluation, given)
     for name, value in evaluation.mean.items():
-        print(f"{name:24}{'-' if value is None else format(value, '.4g')}")
+        if not budget or name not in TABLE:
+            print(f"{name:24}{'-' if value is None else format(value, '.4g')}")
+    if budget:
+        print(format_budget(evaluation.per_view, evaluation.mean))
     if evaluation.refined is not None:
         print("poses were refined against the model before scoring:")
         for row in evaluation.refined:

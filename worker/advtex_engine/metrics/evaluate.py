@@ -22,6 +22,7 @@ from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import TO_Y_UP, Atlas, Fragments, Mesh, Scene, View, evenly_spread
 from advtex_engine.ingest.read import load_scene, opened, sound_scan
 from advtex_engine.mesh.models import load_model, load_reference
+from advtex_engine.metrics.budget import LPIPS_SCORES, budget_scores
 from advtex_engine.metrics.image_metrics import METRICS, nearest_patch_loss
 from advtex_engine.metrics.lpips import Lpips, WeightsError, load_lpips
 from advtex_engine.metrics.sharpness import band_error, flat_energy, s3_ratio
@@ -47,12 +48,7 @@ BYTES_PER_SCORED_VIEW, BYTES_PER_SCORED_PIXEL = 270 << 20, 400
 
 Metric = Callable[[Tensor, Tensor, Tensor], float]
 
-VIEW_METRICS: dict[str, Metric] = {
-    **METRICS,
-    "band_error": band_error,
-    "s3_ratio": s3_ratio,
-    "flat_energy": flat_energy,
-}
+VIEW_METRICS: dict[str, Metric] = {**METRICS, "band_error": band_error, "s3_ratio": s3_ratio}
 PATCH_METRICS: dict[str, Metric] = {
     "nearest_patch": lambda image, photo, mask: nearest_patch_loss(image, photo, mask, queries=PATCH_QUERIES),
     "nearest_patch_reverse": lambda image, photo, mask: nearest_patch_loss(photo, image, mask, queries=PATCH_QUERIES),
@@ -99,6 +95,7 @@ def evaluate(
     weights: Path | None = None,
     sheet: Path | None = None,
     refine_poses: bool = False,
+    budget: bool = False,
     monitor: Monitor | None = None,
 ) -> Evaluation:
     """Scores an OBJ or GLB against a scan's held-out frames, or against all frames without `holdout`.
@@ -108,8 +105,8 @@ def evaluate(
     decides which pixels count, by default the scan's mesh; models compared with each other need the same one. weights:
     see `perceptual.weights_folder`; without them `lpips` and `lpips_full` are None. sheet: PNG to write, photograph |
     render | difference. refine_poses: the frames' poses are refined against the model first, to tell a texture that is
-    displaced from one that is wrong. Raises ScanError, ModelError, OptionError, and EngineError when no view can be
-    scored.
+    displaced from one that is wrong. budget: LPIPS is split into what pose, tone, displacement and content cost
+    (`budget.py`). Raises ScanError, ModelError, OptionError, and EngineError when no view can be scored.
     """
     scene = _load_views(scan, TextureConfig(size=size, holdout=holdout, layout=layout), monitor or Monitor())
     target = scene.mesh if reference is None else load_reference(reference)
@@ -117,6 +114,8 @@ def evaluate(
     if model.suffix.lower() == ".glb":
         atlas = replace(atlas, mesh=_from_y_up(atlas.mesh, scene.up_axis))
     lpips, missing = configured_lpips(weights)
+    if budget and lpips is None:
+        missing |= dict.fromkeys(LPIPS_SCORES, missing["lpips"])
     views, refined = scene.views, None
     if refine_poses:
         views, refined = refine_heldout(atlas, texture, views, scene.kind)
@@ -126,7 +125,8 @@ def evaluate(
         comparison = compare(atlas, texture, view, target)
         if comparison is None:
             continue
-        rows.append({"view": view.name, **score(comparison, lpips, {**VIEW_METRICS, **PATCH_METRICS})})
+        row = {"view": view.name, **score(comparison, lpips, {**VIEW_METRICS, **PATCH_METRICS})}
+        rows.append(row | (_budget(atlas, texture, view, comparison, target, scene.kind, lpips) if budget else {}))
         if view.name in shown:
             pictures.append((view, comparison))
     if not any(row["coverage"] for row in rows):
@@ -136,6 +136,23 @@ def evaluate(
     if sheet is not None and pictures:
         _write_sheet(pictures, sheet)
     return Evaluation(rows, mean_scores(rows), missing, refined)
+
+
+def _budget(
+    atlas: Atlas, texture: Tensor, view: View, given: Comparison, reference: Mesh, kind: str, lpips: Lpips | None
+) -> dict[str, Any]:
+    """What the view's LPIPS is made of; `given` is its comparison at the given pose.
+
+    What the refined camera does not show stays as the given one shows it.
+    """
+    (refined,), (report,) = refine_heldout(atlas, texture, [replace(view, mask=given.mask)], kind)
+    shown = None if report["kept_pose"] else compare(atlas, texture, replace(refined, mask=None), reference)
+    posed, known = given.image, given.covered
+    if shown is not None:
+        new = given.mask & shown.covered
+        posed, known = torch.where(new[..., None], shown.image, posed), known | new
+    scores = budget_scores(given.photo, given.image, posed, given.mask, known, lpips)
+    return {**scores, "pose_pixels": report["moved_pixels"]}
 
 
 def configured_lpips(folder: Path | None = None) -> tuple[Lpips | None, dict[str, str]]:

@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advtex_engine.metrics.image_metrics import eroded, gradient_magnitude, luminance
+from advtex_engine.refine.exposure import BRIGHT, DARK
 
 BANDS = 3
 BAND_SIGMA = 1.2
@@ -143,12 +144,14 @@ def flat_pixels(truth: Tensor, mask: Tensor) -> Tensor:
     """Where a photograph [H,W,3] is flat, [H,W] bool: nothing but noise and slow shading in a 17x17 window.
 
     The window must lie in the mask, and the root mean square of the smoothed luminance's gradient in it must be below
-    FLAT_GRADIENT.
+    FLAT_GRADIENT. Clipped pixels do not count: they have no noise to compare with.
     """
+    smooth = blurred(truth.to(torch.float32).permute(2, 0, 1), FLAT_SIGMA)
+    clear = ((smooth > DARK) & (smooth < BRIGHT)).all(0)
     gradient = gradient_magnitude(blurred(luminance(truth)[None], FLAT_SIGMA)[0])
     radius = FLAT_WINDOW // 2
     square = F.avg_pool2d(gradient.square()[None, None], FLAT_WINDOW, 1, radius)[0, 0]
-    return eroded(mask, radius) & (square < FLAT_GRADIENT**2)
+    return eroded(mask, radius) & (square < FLAT_GRADIENT**2) & clear
 
 
 def blurred(planes: Tensor, sigma: float) -> Tensor:

@@ -13,6 +13,7 @@ import numpy as np
 import platformdirs
 import pytest
 import torch
+from lpips_weights import random_lpips, write_weights
 from torch import Tensor
 
 from advtex_engine.__main__ import main
@@ -30,7 +31,7 @@ from advtex_engine.metrics.evaluate import (
     score_views,
 )
 from advtex_engine.metrics.image_metrics import METRICS
-from advtex_engine.metrics.lpips import FeatureStack, Lpips, Source
+from advtex_engine.metrics.lpips import Source
 from advtex_engine.render.pictures import CAPTION_HEIGHT, GUTTER
 from advtex_engine.render.render_view import render_view
 from advtex_engine.results.export import export_model
@@ -132,30 +133,6 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def no_weights_of_this_machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delenv(perceptual.WEIGHTS_VARIABLE, raising=False)
     monkeypatch.setattr(platformdirs, "user_cache_path", lambda name: tmp_path / "cache" / name)
-
-
-def states() -> dict[str, dict[str, Tensor]]:
-    """Random weights by the names under which they are published."""
-    generator = torch.Generator().manual_seed(0)
-    backbone, heads = dict[str, Tensor](), dict[str, Tensor]()
-    for index, layer in enumerate(perceptual.NETWORKS["alexnet"]):
-        shape = (layer.outputs, layer.inputs, layer.kernel, layer.kernel)
-        backbone[f"features.{layer.number}.weight"] = torch.randn(shape, generator=generator) * 0.05
-        backbone[f"features.{layer.number}.bias"] = torch.zeros(layer.outputs)
-        heads[f"lin{index}.model.1.weight"] = torch.rand((1, layer.outputs, 1, 1), generator=generator)
-    return {"alexnet-owt-7be5be79.pth": backbone, "alex.pth": heads}
-
-
-def write_weights(folder: Path) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, state in states().items():
-        torch.save(state, folder / name)
-    return folder
-
-
-def random_lpips() -> Lpips:
-    backbone, heads = states().values()
-    return Lpips(FeatureStack("alexnet", backbone), list(heads.values()))
 
 
 # Scores ---------------------------------------------------------------------------------------------------------------

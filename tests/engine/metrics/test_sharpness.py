@@ -187,6 +187,14 @@ def test_flat_energy_sees_ringing_and_seams_on_the_wall_only() -> None:
     assert flat_energy(exposed, photo, mask) == pytest.approx(1.02, abs=0.01)
 
 
+@pytest.mark.parametrize("level", [0.0, 1.0])
+def test_flat_energy_leaves_out_what_the_photograph_clips(level: float) -> None:
+    photo = wall()
+    photo[:, 80:] = level
+    image = photo + 0.02 * (noise(120, 160) - 0.5) * (torch.arange(160) >= 90)[None, :, None]
+    assert flat_energy(image, photo, everywhere(photo)) == pytest.approx(1, abs=0.01)
+
+
 def test_flat_energy_says_nothing_without_flat_pixels() -> None:
     busy = noise()
     assert math.isnan(flat_energy(busy, busy, everywhere(busy)))

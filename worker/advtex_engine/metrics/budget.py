@@ -32,6 +32,7 @@ from torch import Tensor
 from advtex_engine.metrics.image_metrics import gradient_magnitude, luminance
 from advtex_engine.metrics.lpips import Lpips
 from advtex_engine.refine.exposure import BRIGHT, DARK, GAIN_RANGE, ROBUST_SCALE
+from advtex_engine.render.texture import fill_holes
 from advtex_engine.selection.toning import LARGEST, REACH
 
 COSTS = ("pose_cost", "tone_cost", "displacement_cost", "content_cost")
@@ -128,7 +129,7 @@ def dense_flow(image: Tensor, photo: Tensor, known: Tensor) -> Tensor:
     """
     inside = known.numpy()
     reach = FLOW_REACH * inside.shape[1]
-    theirs, ours = (_gray(_filled(picture.numpy(), inside, reach)) for picture in (photo, image))
+    theirs, ours = (_gray(fill_holes(picture, known)) for picture in (photo, image))
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     search.setFinestScale(0)  # full size: half of it is a third of a pixel less exact
     flow = search.calc(theirs, ours, np.zeros((*inside.shape, 2), np.float32))
@@ -141,8 +142,7 @@ def warped(image: Tensor, flow: Tensor, known: Tensor) -> Tensor:
     picture, inside = image.numpy(), known.numpy()
     rows, columns = np.indices(inside.shape, dtype=np.float32)
     x, y = columns + flow.numpy()[..., 0], rows + flow.numpy()[..., 1]
-    filled = _filled(picture, inside, FLOW_REACH * inside.shape[1])
-    moved = cv2.remap(filled, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    moved = cv2.remap(fill_holes(image, known).numpy(), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     share = cv2.remap(inside.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     return torch.from_numpy(np.where((inside & (share > INSIDE))[..., None], np.clip(moved, 0, 1), picture))
 
@@ -151,17 +151,12 @@ def _detail(photo: Tensor, known: Tensor) -> Tensor:
     """[H,W]: mean square of the luminance's gradient near each pixel, of known pixels alone."""
     inside = known.numpy()
     reach = FLOW_REACH * inside.shape[1]
-    gradient = gradient_magnitude(luminance(torch.from_numpy(_filled(photo.numpy(), inside, reach))))
+    gradient = gradient_magnitude(luminance(fill_holes(photo, known)))
     return torch.from_numpy(_low_pass(gradient.square()[..., None].numpy(), inside, reach)[..., 0])
 
 
-def _gray(image: Array) -> NDArray[np.uint8]:
-    return (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) * 255).round().clip(0, 255).astype(np.uint8)
-
-
-def _filled(image: Array, known: Mask, reach: float) -> Array:
-    """The image with averages of known pixels nearby in place of all others."""
-    return np.where(known[..., None], image, _low_pass(image, known, reach))
+def _gray(image: Tensor) -> NDArray[np.uint8]:
+    return (luminance(image) * 255).round().clamp(0, 255).to(torch.uint8).numpy()
 
 
 def _low_pass(values: Array, known: Mask, deviation: float) -> Array:

@@ -20,6 +20,7 @@ from advtex_engine.core.config import TextureConfig
 from advtex_engine.core.errors import EngineError
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import TO_Y_UP, Atlas, Fragments, Mesh, Scene, View, evenly_spread
+from advtex_engine.ingest.decode import fill_masked
 from advtex_engine.ingest.read import load_scene, opened, sound_scan
 from advtex_engine.mesh.models import load_model, load_reference
 from advtex_engine.metrics.budget import LPIPS_SCORES, budget_scores
@@ -126,7 +127,7 @@ def evaluate(
         if comparison is None:
             continue
         row = {"view": view.name, **score(comparison, lpips, {**VIEW_METRICS, **PATCH_METRICS})}
-        rows.append(row | (_budget(atlas, texture, view, comparison, target, scene.kind, lpips) if budget else {}))
+        rows.append(row | (view_budget(atlas, texture, view, comparison, target, scene.kind, lpips) if budget else {}))
         if view.name in shown:
             pictures.append((view, comparison))
     if not any(row["coverage"] for row in rows):
@@ -138,15 +139,17 @@ def evaluate(
     return Evaluation(rows, mean_scores(rows), missing, refined)
 
 
-def _budget(
+def view_budget(
     atlas: Atlas, texture: Tensor, view: View, given: Comparison, reference: Mesh, kind: str, lpips: Lpips | None
-) -> dict[str, Any]:
-    """What the view's LPIPS is made of; `given` is its comparison at the given pose.
+) -> Scores:
+    """`budget_scores` of a view, and by how many pixels its camera was moved.
 
-    What the refined camera does not show stays as the given one shows it.
+    given: its comparison at the given pose, whose pixels count all along. What the refined camera does not show of them
+    stays as the given one shows it.
     """
-    (refined,), (report,) = refine_heldout(atlas, texture, [replace(view, mask=given.mask)], kind)
-    shown = None if report["kept_pose"] else compare(atlas, texture, replace(refined, mask=None), reference)
+    color = torch.from_numpy(fill_masked(view.color.numpy(), given.mask.numpy()))
+    (moved,), (report,) = refine_heldout(atlas, texture, [replace(view, color=color, mask=given.mask)], kind)
+    shown = None if report["kept_pose"] else compare(atlas, texture, replace(view, camera=moved.camera), reference)
     posed, known = given.image, given.covered
     if shown is not None:
         new = given.mask & shown.covered

@@ -18,6 +18,7 @@ from advtex_engine.refine.check import improved
 from advtex_engine.refine.pose import refine_poses, sample_points
 from advtex_engine.refine.working_views import CONTRAST_SCALE, motion, working_views
 from advtex_engine.render.render_view import render_view
+from advtex_engine.render.texture import fill_holes
 
 STANDARD_ERRORS = 2.0  # of its improvement, for a view that stands alone: no others vouch for it
 
@@ -43,6 +44,8 @@ def refine_heldout(
 def _refined_pose(atlas: Atlas, texture: Tensor, view: View, kind: str, seed: int) -> tuple[Tensor | None, Tensor]:
     """world_to_camera [4,4], None to keep the given one; and millimetres, degrees, and pixels of the view, [3]."""
     render = render_view(atlas, texture, view.camera)
+    if view.mask is not None:
+        render = fill_holes(render, view.mask.to(render.device))  # as the photograph is filled
     model = replace(view, name="model", color=(render.clamp(0, 1) * 255).round().to(torch.uint8))
     working = working_views(atlas.mesh, (view, model), kind, texture.device, seed)
     if working is None:

@@ -1,0 +1,254 @@
+"""The budget of renders whose one fault is known: each part's cost goes where it belongs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from lpips_weights import random_lpips, write_weights
+from torch import Tensor
+from wavy_sheet import camera_over, paint, sheet
+
+from advtex_engine.__main__ import main
+from advtex_engine.core.cameras import scaled_camera
+from advtex_engine.core.scene import Atlas, View
+from advtex_engine.metrics.budget import (
+    COSTS,
+    LPIPS_SCORES,
+    TABLE,
+    budget_scores,
+    corrected_tone,
+    dense_flow,
+    warped,
+)
+from advtex_engine.metrics.evaluate import Scores, compare, view_budget
+from advtex_engine.metrics.lpips import Lpips
+from advtex_engine.refine.pose import exponential
+from advtex_engine.render.render_view import render_view
+from advtex_engine.results.export import export_model
+
+WIDTH, HEIGHT, TEXELS = 320, 240, 512
+CAMERA = scaled_camera(camera_over(0, 8), WIDTH, HEIGHT)
+
+
+@pytest.fixture(scope="module")
+def lpips() -> Lpips:
+    return random_lpips()
+
+
+def relief() -> Atlas:
+    mesh = sheet(4.0, 40, (0.15, 3.0, 2.0, 0.0))
+    return Atlas(mesh, TEXELS, TEXELS, "scan", 1)
+
+
+def painted() -> Tensor:
+    line = (torch.arange(TEXELS) + 0.5) / TEXELS * 4 - 2
+    y, x = torch.meshgrid(line, line, indexing="ij")
+    return paint(torch.stack((x, y), -1))
+
+
+@pytest.fixture(scope="module")
+def photo() -> Tensor:
+    """What the camera sees, with a little noise."""
+    color = render_view(relief(), painted(), CAMERA)
+    return (color + 0.003 * torch.randn(color.shape, generator=torch.Generator().manual_seed(3))).clamp(0, 1)
+
+
+def region() -> Tensor:
+    """[H,W] bool: most of the view, with a ragged edge and a hole."""
+    rows, columns = torch.arange(HEIGHT)[:, None], torch.arange(WIDTH)
+    mask = (rows > 10 + 6 * (columns / 9).sin()) & (columns < WIDTH - 12)
+    mask[100:130, 60:110] = False
+    return mask
+
+
+def smooth_flow(largest: float) -> Tensor:
+    """[H,W,2] pixels, of waves as wide as the view."""
+    rows, columns = np.indices((HEIGHT, WIDTH), dtype=np.float32)
+    right, down = np.sin(rows / 40) * np.cos(columns / 60), np.cos(rows / 50 + columns / 70)
+    return torch.from_numpy(largest * np.stack((right, down), -1))
+
+
+def moved(image: Tensor, flow: Tensor) -> Tensor:
+    """What the image shows at p - flow(p)."""
+    rows, columns = np.indices((HEIGHT, WIDTH), dtype=np.float32)
+    x, y = columns - flow[..., 0].numpy(), rows - flow[..., 1].numpy()
+    return torch.from_numpy(cv2.remap(image.numpy(), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)).clamp(0, 1)
+
+
+def blurred(image: Tensor) -> Tensor:
+    return torch.from_numpy(cv2.GaussianBlur(image.numpy(), (0, 0), 2.0))
+
+
+def vignetted(image: Tensor) -> Tensor:
+    columns = torch.linspace(-1, 1, WIDTH)[:, None]
+    return (image + 0.12 * columns).clamp(0, 1)
+
+
+def of_image(image: Tensor, photo: Tensor, lpips: Lpips | None) -> Scores:
+    mask = region()
+    shown = torch.where(mask[..., None], image, photo)
+    return budget_scores(photo, shown, shown, mask, mask, lpips)
+
+
+def raw(scores: Scores) -> float:
+    return sum(scores[name] or 0.0 for name in COSTS)
+
+
+def share(scores: Scores, name: str) -> float:
+    return (scores[name] or 0.0) / raw(scores)
+
+
+def test_what_exposure_and_white_balance_cost_is_tone(photo: Tensor, lpips: Lpips) -> None:
+    exposed = photo * torch.tensor([0.6, 0.7, 0.8]) + 0.03
+    assert share(of_image(exposed, photo, lpips), "tone_cost") > 0.95
+
+
+def test_what_a_vignette_costs_is_tone(photo: Tensor, lpips: Lpips) -> None:
+    assert share(of_image(vignetted(photo), photo, lpips), "tone_cost") > 0.8
+
+
+def test_what_a_smooth_flow_costs_is_displacement(photo: Tensor, lpips: Lpips) -> None:
+    flow = smooth_flow(3.0)
+    scores = of_image(moved(photo, flow), photo, lpips)
+    assert share(scores, "displacement_cost") > 0.7
+    truth = float(flow.norm(dim=-1)[region()].median())
+    assert scores["displacement_pixels"] == pytest.approx(truth, rel=0.15)
+
+
+def test_what_blur_costs_is_content(photo: Tensor, lpips: Lpips) -> None:
+    scores = of_image(blurred(photo), photo, lpips)
+    assert share(scores, "content_cost") > 0.9
+    assert scores["displacement_pixels"] is not None
+    assert scores["displacement_pixels"] < 0.5
+
+
+def test_what_a_wrong_pose_costs_is_pose(photo: Tensor, lpips: Lpips) -> None:
+    """Turned and moved by some pixels."""
+    motion = exponential(torch.tensor([[0.006, -0.008, 0.004, 0.01, 0.008, -0.01]], dtype=torch.float64))[0]
+    wrong = replace(CAMERA, world_to_camera=motion @ CAMERA.world_to_camera)
+    color = (photo * 255).round().to(torch.uint8)
+    atlas, texture = relief(), painted()
+    view = View("view", wrong, color, mask=region())
+    given = compare(atlas, texture, view)
+    assert given is not None
+    scores = view_budget(atlas, texture, view, given, atlas.mesh, "scene", lpips)
+    assert scores["pose_pixels"] is not None
+    assert scores["pose_pixels"] > 1.5
+    assert share(scores, "pose_cost") > 0.9
+    assert scores["displacement_pixels"] is not None
+    assert scores["displacement_pixels"] < 0.4
+    assert raw(scores) == pytest.approx(lpips.masked(given.image, given.photo, given.mask), abs=1e-9)
+
+    elsewhere = torch.where(given.mask[..., None], color, 255 - color)
+    other = replace(view, color=elsewhere)
+    again = compare(atlas, texture, other)
+    assert again is not None
+    assert view_budget(atlas, texture, other, again, atlas.mesh, "scene", None)["pose_pixels"] == scores["pose_pixels"]
+
+
+def test_all_costs_sum_to_the_raw_figure(photo: Tensor, lpips: Lpips) -> None:
+    image = blurred(moved(vignetted(photo * 0.8), smooth_flow(2.0)))
+    scores = of_image(image, photo, lpips)
+    assert raw(scores) == pytest.approx(lpips.masked(image, photo, region()), abs=1e-9)
+    assert all((scores[name] or 0.0) > 0 for name in ("tone_cost", "displacement_cost", "content_cost"))
+    left = (scores["displacement_cost"] or 0.0) + (scores["content_cost"] or 0.0)
+    assert scores["lpips_corrected"] == pytest.approx(left, abs=1e-9)
+
+
+def test_a_correction_that_makes_things_worse_costs_less_than_nothing(photo: Tensor, lpips: Lpips) -> None:
+    mask = region()
+    worse = torch.where(mask[..., None], photo.roll(5, 1), photo)
+    scores = budget_scores(photo, photo, worse, mask, mask, lpips)
+    assert (scores["pose_cost"] or 0.0) < -0.001
+    assert raw(scores) == pytest.approx(0, abs=1e-9)
+
+
+def test_pixels_that_do_not_count_change_nothing(photo: Tensor) -> None:
+    mask = region()
+    image = moved(vignetted(photo * 0.8), smooth_flow(2.0))
+    noise = torch.rand(photo.shape, generator=torch.Generator().manual_seed(1))
+    other_photo, other_image = (torch.where(mask[..., None], picture, noise) for picture in (photo, image))
+    found = []
+    for ours, theirs in ((image, photo), (other_image, other_photo)):
+        toned = corrected_tone(ours, theirs, mask)
+        flow = dense_flow(toned, theirs, mask)
+        found.append((toned[mask], flow[mask], warped(toned, flow, mask)[mask]))
+    assert all(torch.equal(first, second) for first, second in zip(*found, strict=True))
+
+
+def test_holes_of_the_model_stay_black(photo: Tensor) -> None:
+    known = region()
+    known[150:180, 200:260] = False
+    image = torch.where(known[..., None], moved(photo * 0.7 + 0.1, smooth_flow(2.0)), 0.0)
+    toned = corrected_tone(image, photo, known)
+    after = warped(toned, dense_flow(toned, photo, known), known)
+    assert bool((after[~known] == 0).all())
+    assert float(after[known].min()) > 0.02, "nothing is drawn from the holes"
+
+
+def test_clipped_pixels_do_not_decide_the_exposure(photo: Tensor) -> None:
+    bright = (1.7 * photo).clamp(0, 1)
+    clear = (bright < 0.95).all(-1)
+    assert 0.2 < float(clear.to(torch.float32).mean()) < 0.9
+    toned = corrected_tone(photo, bright, torch.ones_like(clear))
+    assert float((toned - bright)[clear].abs().mean()) < 1e-4
+
+
+def test_without_weights_the_displacement_is_measured(photo: Tensor) -> None:
+    scores = of_image(moved(photo, smooth_flow(3.0)), photo, None)
+    assert all(scores[name] is None for name in LPIPS_SCORES)
+    assert scores["displacement_pixels"] is not None
+
+
+def test_a_model_that_shows_nothing_has_no_displacement(photo: Tensor, lpips: Lpips) -> None:
+    nothing = torch.zeros_like(region())
+    black = torch.where(region()[..., None], 0.0, photo)
+    scores = budget_scores(photo, black, black, region(), nothing, lpips)
+    assert scores["displacement_pixels"] is None
+    assert share(scores, "content_cost") == 1
+
+
+def write_scan(folder: Path, photo: Tensor) -> Path:
+    """Three frames of the same photograph, in the native layout."""
+    folder.mkdir()
+    frames = []
+    for name in ("0.png", "1.png", "2.png"):
+        cv2.imwrite(str(folder / name), (photo * 255).round().to(torch.uint8).numpy()[..., ::-1])
+        frames.append({"color": name, "camera_to_world": torch.linalg.inv(CAMERA.world_to_camera).tolist()})
+    fx, fy, cx, cy = (float(CAMERA.K[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    size = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": WIDTH, "height": HEIGHT}
+    scan = {"version": 1, "kind": "scene", "up_axis": "+z", "mesh": "mesh.obj", "color_intrinsics": size}
+    (folder / "scan.json").write_text(json.dumps({**scan, "frames": frames}))
+    mesh = relief().mesh
+    lines = [f"v {x} {y} {z}" for x, y, z in mesh.v_pos.tolist()]
+    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.t_pos_idx.tolist()]
+    (folder / "mesh.obj").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def test_the_command_writes_the_budget_when_asked(
+    photo: Tensor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    export_model(tmp_path / "model", relief(), 0.8 * painted(), up_axis="+z")
+    command = ["evaluate", str(tmp_path / "model/model.obj"), str(write_scan(tmp_path / "scan", photo))]
+    command += ["--size", "160x120", "--holdout", "3", "--budget"]
+    path = tmp_path / "scores.json"
+    assert main([*command, "--json", str(path), "--lpips-weights", str(write_weights(tmp_path / "weights"))]) == 0
+    written = json.loads(path.read_text())
+    for row in (*written["per_view"], written["mean"]):
+        assert sum(row[name] for name in COSTS) == pytest.approx(row["lpips"], abs=1e-9)
+        assert row["tone_cost"] > 0.5 * row["lpips"]
+    *_, head, view, mean = capsys.readouterr().out.splitlines()
+    assert head.split() == " ".join(["view", *TABLE.values()]).split()
+    assert [line.split()[0] for line in (view, mean)] == ["000001", "mean"]
+    assert float(mean.split()[1]) == pytest.approx(written["mean"]["lpips"], abs=1e-4)
+
+    assert main([*command, "--json", str(path), "--lpips-weights", str(tmp_path)]) == 0
+    assert set(json.loads(path.read_text())["missing"]) == {"lpips", "lpips_full", *LPIPS_SCORES}
+    assert capsys.readouterr().out.splitlines()[-1].split()[:2] == ["mean", "-"]

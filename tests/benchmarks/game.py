@@ -59,6 +59,8 @@ TABLE = {
     "l1": "L1",
     "skipped": "skipped",
     "lpips": "LPIPS",
+    "lpips_corrected": "corrected LPIPS",
+    "displacement_pixels": "displacement, pixels",
     "gradient_ratio": "gradient ratio",
     "flat_energy": "energy where flat",
     "speckle": "speckled texels",

@@ -14,6 +14,7 @@ import json
 import math
 import os
 import shlex
+import statistics
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -62,13 +63,20 @@ SCORES = {
     "gradient_difference": "gradient difference",
     "gradient_ratio": "gradient ratio",
 }
-SCAN_SCORES = {
+COMPARED_SCORES = {
     "lpips": "LPIPS",
-    "lpips_full": "full image",
+    "lpips_corrected": "corrected LPIPS",
+    "displacement_cost": "of it displacement",
+    "displacement_pixels": "displacement, pixels",
     "gradient_ratio": "gradient ratio",
+    "flat_energy": "energy where flat",
+}
+"""Of real scans, and of all of them together; corrected: with pose and tone of the held-out views put right."""
+SCAN_SCORES = {
+    **COMPARED_SCORES,
+    "lpips_full": "full image",
     "band_error": "band error",
     "s3_ratio": "S3 ratio",
-    "flat_energy": "energy where flat",
     "nearest_patch": "nearest patch",
     "nearest_patch_reverse": "nearest patch, photo to texture",
     "psnr": "PSNR",
@@ -184,6 +192,7 @@ def score_model(
         reference=reference,
         weights=weights,
         sheet=folder / "sheet.png",
+        budget=True,
     )
     scores = {name: value for name in SCAN_SCORES if (value := found.mean[name]) is not None}
     return scores | {"heldout_views": float(found.mean["views"])}
@@ -238,6 +247,25 @@ def mean_of(cells: Sequence[Mapping[str, Any]], name: str) -> float:
 def shown_mean(cells: Sequence[Mapping[str, Any]], name: str) -> float | str:
     """The same for a table: a dash where a cell lacks the score."""
     return mean_of(cells, name) if all(name in cell["scores"] for cell in cells) else "-"
+
+
+def geometric_means(label: str, lines: Mapping[str, Sequence[Mapping[str, Any] | None]]) -> str:
+    """A section with COMPARED_SCORES over scans; empty for one scan. lines: per row its cell of each scan.
+
+    Rows that lack a scan are left out: what is easy would be compared with what is not.
+    """
+    whole = {name: [cell for cell in cells if cell is not None] for name, cells in lines.items() if all(cells)}
+    count = max(map(len, whole.values()), default=0)
+    if count < 2:
+        return ""
+    rows = [[name, *(geometric_mean(cells, score) for score in COMPARED_SCORES)] for name, cells in whole.items()]
+    return f"\n## Geometric mean over {count} scans\n\n{markdown_table([label, *COMPARED_SCORES.values()], rows)}"
+
+
+def geometric_mean(cells: Sequence[Mapping[str, Any]], name: str) -> float | str:
+    """Of a score over cells, for a table: a dash where a cell lacks it or has none above 0."""
+    values = [cell["scores"].get(name, 0.0) for cell in cells]
+    return statistics.geometric_mean(values) if min(values) > 0 else "-"
 
 
 def picture(atlas: Atlas, texture: Tensor, truth: Truth) -> Tensor:

@@ -28,6 +28,7 @@ from harness import (
     common_arguments,
     configuration,
     draw,
+    geometric_means,
     load_truth,
     markdown_table,
     needed_lpips,
@@ -153,7 +154,7 @@ def textures(
 
 
 def report(arguments: argparse.Namespace, results: Results) -> None:
-    """parts.md: means over the synthetic objects, then a table per scan."""
+    """parts.md: means over the synthetic objects, then a table per scan, and the geometric means over all scans."""
     tables = {}
     for synthetic in arguments.synthetic:
         models = range(arguments.models)
@@ -173,6 +174,10 @@ def report(arguments: argparse.Namespace, results: Results) -> None:
                 rows.append([name, *(shown_mean(cells, score) for score in scores), seconds])
                 found += cells
         body += f"\n## {title}\n\n{markdown_table(['variant', *scores.values(), 'seconds'], rows)}"
+    over_scans = {
+        name: [results.find(scan_settings_of(arguments, scan, name)) for scan in arguments.scans] for name in VARIANTS
+    }
+    body += geometric_means("variant", over_scans)
     write_report(arguments.results / "parts.md", "What each part is worth", found, body)
 
 

@@ -20,6 +20,7 @@ from harness import (
     SCAN_SCORES,
     Results,
     Stopwatch,
+    geometric_means,
     markdown_table,
     needed_lpips,
     parsed_size,
@@ -102,7 +103,7 @@ def _run(arguments: argparse.Namespace, scan: Path, given: MethodInput, cell: di
 
 
 def report(arguments: argparse.Namespace, results: Results) -> None:
-    """scans.md: a table per scan, the best LPIPS first."""
+    """scans.md: a table per scan, the best LPIPS first, and the geometric means over all scans."""
     body, wanted = "", list[dict[str, Any]]()
     for scan in arguments.scans:
         found = [results.find(settings_of(arguments, scan, method)) for method in arguments.methods]
@@ -117,6 +118,11 @@ def report(arguments: argparse.Namespace, results: Results) -> None:
         ]
         body += f"\n## {scan.stem}\n\n{markdown_table(['method', *SCAN_SCORES.values(), 'seconds'], rows)}"
         wanted += cells
+    lines = {
+        method: [results.find(settings_of(arguments, scan, method)) for scan in arguments.scans]
+        for method in arguments.methods
+    }
+    body += geometric_means("method", lines)
     write_report(arguments.results / "scans.md", "Methods on scans", wanted, body)
 
 

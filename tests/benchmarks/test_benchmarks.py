@@ -68,6 +68,19 @@ def test_a_page_says_when_and_how_it_was_made(tmp_path: Path, monkeypatch: pytes
     assert page.endswith("| method | LPIPS | objects |\n| --- | --- | --- |\n| mean | 0.250 | 3 |\n")
 
 
+def test_scans_are_put_together_by_geometric_means() -> None:
+    def cell(lpips: float, cost: float) -> dict[str, Any]:
+        return {"scores": {"lpips": lpips, "lpips_corrected": lpips / 2, "displacement_cost": cost}}
+
+    lines = {"mean": [cell(0.1, 0.01), cell(0.4, -0.01)], "l1": [cell(0.1, 0.01), None]}
+    table = harness.geometric_means("method", lines)
+    assert "## Geometric mean over 2 scans" in table
+    assert "| method | LPIPS | corrected LPIPS | of it displacement |" in table
+    assert "| mean | 0.200 | 0.100 | - | - |" in table
+    assert "| l1 |" not in table
+    assert harness.geometric_means("method", {"mean": [cell(0.1, 0.01)]}) == ""
+
+
 @pytest.mark.slow
 def test_the_study_makes_a_table_and_does_nothing_twice(
     tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
@@ -176,7 +189,10 @@ def test_methods_are_compared_on_a_scan(tmp_path: Path, weights: Path, monkeypat
         ("mean", 2.0),
         ("view_selection", 2.0),
     }
+    for cell in found:
+        assert {"lpips", "lpips_corrected", "displacement_cost", "displacement_pixels"} <= set(cell["scores"])
     page = (tmp_path / "out" / "scans.md").read_text()
+    assert "| method | LPIPS | corrected LPIPS | of it displacement | displacement, pixels |" in page
     assert all(f"| {method} |" in page for method in ("mean", "view_selection"))
     assert (tmp_path / "out" / "desk" / "mean" / "sheet.png").stat().st_size > 1000
 

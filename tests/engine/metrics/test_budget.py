@@ -215,20 +215,16 @@ def test_a_model_that_shows_nothing_has_no_displacement(photo: Tensor, lpips: Lp
 
 
 def write_scan(folder: Path, photo: Tensor) -> Path:
-    """Three frames of the same photograph, in the native layout."""
-    folder.mkdir()
+    """Three frames of the same photograph, in the native layout, beside the model that they show."""
+    export_model(folder, relief(), painted(), up_axis="+z")
     frames = []
     for name in ("0.png", "1.png", "2.png"):
         cv2.imwrite(str(folder / name), (photo * 255).round().to(torch.uint8).numpy()[..., ::-1])
         frames.append({"color": name, "camera_to_world": torch.linalg.inv(CAMERA.world_to_camera).tolist()})
     fx, fy, cx, cy = (float(CAMERA.K[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
     size = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": WIDTH, "height": HEIGHT}
-    scan = {"version": 1, "kind": "scene", "up_axis": "+z", "mesh": "mesh.obj", "color_intrinsics": size}
+    scan = {"version": 1, "kind": "scene", "up_axis": "+z", "mesh": "model.obj", "color_intrinsics": size}
     (folder / "scan.json").write_text(json.dumps({**scan, "frames": frames}))
-    mesh = relief().mesh
-    lines = [f"v {x} {y} {z}" for x, y, z in mesh.v_pos.tolist()]
-    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.t_pos_idx.tolist()]
-    (folder / "mesh.obj").write_text("\n".join(lines) + "\n")
     return folder
 
 

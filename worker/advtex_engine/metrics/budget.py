@@ -7,8 +7,9 @@ One thing after the other is put right in the render, in this order, and LPIPS o
    degrees of freedom know of parallax, and rendering resamples nothing, where a homography fits planes and blurs.
 2. tone: a robust gain and offset per channel (exposure, white balance), then wide averages (vignetting, light that
    depends on the view), both from pixels that are clipped in neither image.
-3. displacement: a dense flow moves the render onto the photograph. It is smooth, so it cannot copy detail; what wrong
-   geometry, cameras and misplaced texture cost beyond its reach counts as content.
+3. displacement: a dense flow moves the render onto the photograph. It is smooth, so it cannot copy detail, and pixels
+   stay that would come from where none count; what wrong geometry, cameras and misplaced texture cost beyond its reach
+   counts as content.
 4. content: what is left. Blur, seams, clipped lights, parts that the mesh lacks.
 
 A part's cost is the LPIPS before it was put right less that after it, and below 0 where that made things worse. The

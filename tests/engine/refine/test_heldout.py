@@ -15,7 +15,7 @@ from advtex_engine.__main__ import main
 from advtex_engine.core.cameras import project
 from advtex_engine.core.scene import Atlas, Camera, Mesh, View
 from advtex_engine.refine.heldout import refine_heldout
-from advtex_engine.refine.pose import exponential
+from advtex_engine.refine.pose import exponential, twist
 from advtex_engine.render.render_view import render_view
 from advtex_engine.results.export import export_model
 
@@ -97,6 +97,21 @@ def test_known_errors_are_found() -> None:
         assert torch.equal(new.camera.K, view.camera.K)
     moved = torch.tensor([row["moved_pixels"] for row in report])
     assert (moved / before - 1).abs().max() < 0.4
+
+
+def test_a_pixel_under_noise_is_found_by_who_takes_the_better_guess() -> None:
+    views = []
+    for index, pose in enumerate(misplaced()):
+        motion = pose @ torch.linalg.inv(camera(index).world_to_camera)
+        small = exponential(0.4 * twist(motion[None]))[0] @ camera(index).world_to_camera
+        noise = 25 * torch.randn(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(index))
+        color = (photograph(index) + noise).clamp(0, 255).round().to(torch.uint8)
+        views.append(View(str(index), replace(camera(index), world_to_camera=small), color))
+    _, sure = refine_heldout(relief(), blobs(), views, "scene")
+    refined, guessed = refine_heldout(relief(), blobs(), views, "scene", standard_errors=0.0)
+    assert any(row["kept_pose"] for row in sure)
+    assert not any(row["kept_pose"] for row in guessed)
+    assert errors([view.camera.world_to_camera for view in refined]).max() < 0.25
 
 
 def test_a_photograph_of_something_else_keeps_its_pose() -> None:

@@ -24,16 +24,21 @@ STANDARD_ERRORS = 2.0  # of its improvement, for a view that stands alone: no ot
 
 
 def refine_heldout(
-    atlas: Atlas, texture: Tensor, views: Sequence[View], kind: str, seed: int = 0
+    atlas: Atlas,
+    texture: Tensor,
+    views: Sequence[View],
+    kind: str,
+    seed: int = 0,
+    standard_errors: float = STANDARD_ERRORS,
 ) -> tuple[tuple[View, ...], list[dict[str, Any]]]:
     """The views with refined poses, and per view its name, whether it kept its pose, and how far the camera moved.
 
     texture: [atlas.height,atlas.width,3] uint8 sRGB or float in [0,1]. A view keeps its pose unless it shows the model
-    better from the new one at points that were set aside. Not differentiable.
+    better from the new one, by so many standard errors, at points that were set aside. Not differentiable.
     """
     refined, report = [], []
     for view in views:
-        pose, moved = _refined_pose(atlas, texture, view, kind, seed)
+        pose, moved = _refined_pose(atlas, texture, view, kind, seed, standard_errors)
         refined.append(view if pose is None else replace(view, camera=replace(view.camera, world_to_camera=pose)))
         millimetres, degrees, pixels = (round(float(part), 4) for part in moved)
         described = {"moved_mm": millimetres, "turned_degrees": degrees, "moved_pixels": pixels}
@@ -41,7 +46,9 @@ def refine_heldout(
     return tuple(refined), report
 
 
-def _refined_pose(atlas: Atlas, texture: Tensor, view: View, kind: str, seed: int) -> tuple[Tensor | None, Tensor]:
+def _refined_pose(
+    atlas: Atlas, texture: Tensor, view: View, kind: str, seed: int, standard_errors: float
+) -> tuple[Tensor | None, Tensor]:
     """world_to_camera [4,4], None to keep the given one; and millimetres, degrees, and pixels of the view, [3]."""
     render = render_view(atlas, texture, view.camera)
     if view.mask is not None:
@@ -57,7 +64,7 @@ def _refined_pose(atlas: Atlas, texture: Tensor, view: View, kind: str, seed: in
     )
     values = before.value[..., None], after.value[..., None]
     both = before.valid & after.valid
-    if not improved(*values, both, working.checked, working.checked_cell, CONTRAST_SCALE, STANDARD_ERRORS)[0]:
+    if not improved(*values, both, working.checked, working.checked_cell, CONTRAST_SCALE, standard_errors)[0]:
         return None, torch.zeros(3)
     scale = torch.tensor([1.0, 1.0, view.camera.width / working.size[0]])
     return found[0].to(view.camera.world_to_camera), motion(found, working)[0] * scale

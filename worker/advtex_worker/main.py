@@ -82,6 +82,16 @@ class JobWorker(Worker):
         super().heartbeat(timeout, pipeline)
         self._announce(pipeline)
 
+    def work(self, *args: Any, **named: Any) -> bool:
+        """RQ's; but it leaves a thread that listens for commands, and its connection, behind whenever it cannot take
+        leave of Redis."""
+        try:
+            return bool(super().work(*args, **named))
+        finally:
+            if self.pubsub_thread is not None:
+                self.pubsub_thread.stop()
+            self.connection.connection_pool.disconnect()  # wakes it
+
     def register_death(self) -> None:
         self._presence.depart(self._known_as)
         super().register_death()  # type: ignore[no-untyped-call]

@@ -1,0 +1,35 @@
+"""A worker that loses Redis begins anew with another connection, and leaves nothing of the old one behind."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import redis.exceptions
+
+from advtex_store.queue import connect_redis
+from advtex_worker.main import JobWorker
+from advtex_worker.tasks import Host
+
+
+def test_what_listened_to_a_redis_that_is_gone_ends(
+    host: Callable[[str], Host], own_redis: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = host("quick").settings.model_copy(update={"redis_url": own_redis.url})
+    connection = connect_redis(settings)
+    worker = JobWorker(Host(settings), connection, threading.Event(), 8)
+
+    def lose(*_: object) -> None:
+        own_redis.stop()
+        raise redis.exceptions.TimeoutError("silence")
+
+    monkeypatch.setattr(worker, "dequeue_job_and_maintain_ttl", lose)
+    monkeypatch.setattr(worker, "_install_signal_handlers", lambda: None)
+    with pytest.raises(redis.exceptions.RedisError):
+        worker.work(logging_level="WARNING")
+    listener = worker.pubsub_thread
+    assert listener is not None
+    listener.join(10)
+    assert not listener.is_alive()

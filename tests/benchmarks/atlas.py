@@ -30,7 +30,7 @@ from advtex_engine.core.scene import Camera, Mesh
 from advtex_engine.mesh.clean import clean
 from advtex_engine.mesh.models import load_reference
 from advtex_engine.runtime.stage_records import peak_memory_bytes
-from advtex_engine.synthetic.object import look_at
+from advtex_engine.synthetic.patches import look_at
 
 DATA = Path(os.environ.get("ADVTEX_DATA", Path(__file__).parents[3] / "shared" / "data"))
 SIDE = 8192

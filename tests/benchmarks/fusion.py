@@ -32,7 +32,7 @@ from advtex_engine.mesh.fusion import fuse
 from advtex_engine.mesh.models import load_model
 from advtex_engine.render.rasterize import rasterize
 from advtex_engine.runtime.stage_records import peak_memory_bytes, reset_peak_memory
-from advtex_engine.synthetic.object import look_at
+from advtex_engine.synthetic.patches import look_at
 from advtex_engine.synthetic.scan import synthesize
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))

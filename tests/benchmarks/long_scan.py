@@ -31,7 +31,7 @@ from advtex_engine.core.monitor import Monitor
 from advtex_engine.ingest.frames import FrameStore
 from advtex_engine.ingest.read import read_capture
 from advtex_engine.mesh.clean import clean, decimate
-from advtex_engine.synthetic.object import look_at
+from advtex_engine.synthetic.patches import look_at
 
 COLOR, DEPTH = (1296, 968), (640, 480)
 FOCAL = 1170.0  # of the color camera; both see the same

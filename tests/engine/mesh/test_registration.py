@@ -16,7 +16,7 @@ from advtex_engine.core.cameras import project
 from advtex_engine.core.scene import Camera, DepthFrame, Mesh
 from advtex_engine.mesh.registration import move_mesh, register_camera, register_mesh
 from advtex_engine.render.rasterize import rasterize
-from advtex_engine.synthetic.object import look_at
+from advtex_engine.synthetic.patches import look_at
 
 NOISE = 0.002
 

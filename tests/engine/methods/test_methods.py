@@ -36,7 +36,7 @@ from advtex_engine.render.render_view import render_view
 from advtex_engine.render.texels import map_texels
 from advtex_engine.render.view_maps import build_view_maps
 from advtex_engine.runtime.checkpoint import WorkFolder
-from advtex_engine.synthetic.object import look_at
+from advtex_engine.synthetic.patches import look_at
 from advtex_engine.synthetic.planar import planar_maps
 from advtex_options.methods import BUILT_IN, Method, known_methods
 

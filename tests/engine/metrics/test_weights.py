@@ -26,7 +26,7 @@ from advtex_engine.ingest.frames import FrameStore
 from advtex_engine.ingest.read import ingest, read_capture
 from advtex_engine.mesh.registration import register_mesh
 from advtex_engine.render.rasterize import rasterize
-from advtex_engine.synthetic.object import look_at
+from advtex_engine.synthetic.patches import look_at
 
 WIDTH, HEIGHT, VIEWS = 96, 72, 8
 Pair = tuple[Path, Path]

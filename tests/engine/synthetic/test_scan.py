@@ -27,6 +27,7 @@ from advtex_engine.ingest.read import ingest
 from advtex_engine.render.rasterize import rasterize
 from advtex_engine.results.export import export_model, vertex_normals
 from advtex_engine.synthetic import object as synthetic_object
+from advtex_engine.synthetic import patches
 from advtex_engine.synthetic import scan as module
 from advtex_engine.synthetic.scan import CAMERA_ERROR, DISTANCE, GEOMETRY_ERROR, compare_to_truth, synthesize
 from advtex_scan.check import check_scan
@@ -38,7 +39,7 @@ VIEWS, WIDTH, HEIGHT = 6, 96, 72
 def few_lights() -> Iterator[None]:
     """Shadows are as good from few lights here, and sooner."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(synthetic_object, "LIGHTS", 8)
+        patch.setattr(patches, "LIGHTS", 8)
         yield
 
 
@@ -205,7 +206,7 @@ def test_every_visible_surface_faces_outwards(still_life: Any) -> None:
 @settings(max_examples=30, deadline=None)
 def test_charts_lie_apart_and_inside(shapes: list[tuple[int, int]]) -> None:
     taken = np.zeros((synthetic_object.TEXTURE_SIZE,) * 2, bool)
-    for (height, width), (row, column) in zip(shapes, synthetic_object._pack(shapes), strict=True):
+    for (height, width), (row, column) in zip(shapes, patches.pack(shapes, synthetic_object.TEXTURE_SIZE), strict=True):
         assert row >= 1
         assert column >= 1
         place = taken[row - 1 : row + height + 1, column - 1 : column + width + 1]

@@ -3,64 +3,35 @@
 A tea tin with a lid and a carrying arch, a mug in front of it, a book and a toy block: parts hide each other from
 most directions, and their print is as fine as a scanner's camera resolves. World: metres, +z up, the turntable's
 axis is the z axis and its foot lies at z = 0.
-
-The object is a list of patches. A patch is a surface over the unit square (s to the right, t downwards, seen from
-outside), the (s, t) of its vertices on a grid, and a drawing that covers the square: its chart in the atlas.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 
-import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from advtex_engine.core.scene import Atlas, Camera, Mesh
-from advtex_engine.render.rasterize import rasterize
+from advtex_engine.core.scene import Atlas
 from advtex_engine.synthetic import print as prints
-
-Array = NDArray[np.float64]
-Surface = Callable[[Array], Array]
+from advtex_engine.synthetic.patches import Array, Patch, Sky, Surface, join, light, pack, paint, shaded, square_grid
 
 TEXTURE_SIZE = 2048
 DENSITY = 3.1
 """Texels per millimetre: the drawings fill the atlas."""
 SPACING = 4.5
 """Millimetres between vertices: fine enough for the paper's per-vertex offsets to bend every surface."""
-GAP = 3
-"""Texels between charts; each drawing is continued into half of it."""
-LIGHTS = 48
-"""Directions that light the object; each casts a shadow, together they are soft."""
-SHADE_STEP = 4
-"""Light is worked out for every so many texels and interpolated."""
-
-
-@dataclass(frozen=True)
-class Patch:
-    """surface: (s, t) [..., 2] -> millimetres [..., 3]; grid: [R,C,2] (s, t) of the vertices; drawing: [H,W,3]."""
-
-    surface: Surface
-    grid: Array
-    drawing: prints.Image
 
 
 def build(seed: int = 0) -> tuple[Atlas, torch.Tensor]:
     """The object with its atlas, and its texture [TEXTURE_SIZE,TEXTURE_SIZE,3] uint8 sRGB; light is baked in."""
     patches = list(_patches(np.random.default_rng(seed)))
-    corners = _pack([patch.drawing.shape[:2] for patch in patches])
-    mesh = _mesh(patches, corners)
-    shades = _light(mesh, patches)
-    texture = np.full((TEXTURE_SIZE, TEXTURE_SIZE, 3), 128, np.uint8)
-    for patch, shade, (row, column) in zip(patches, shades, corners, strict=True):
-        height, width = patch.drawing.shape[:2]
-        lit = _shaded(patch.drawing, shade)
-        framed = cv2.copyMakeBorder(lit, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
-        texture[row - 1 : row + height + 1, column - 1 : column + width + 1] = framed
-    return Atlas(mesh, TEXTURE_SIZE, TEXTURE_SIZE, "scan", len(patches)), torch.from_numpy(texture)
+    corners = pack([patch.drawing.shape[:2] for patch in patches], TEXTURE_SIZE)
+    mesh = join(patches, corners, TEXTURE_SIZE)
+    lit = [shaded(patch.drawing, shade) for patch, shade in zip(patches, light(mesh, patches, Sky()), strict=True)]
+    texture = torch.from_numpy(paint(lit, corners, TEXTURE_SIZE))
+    return Atlas(mesh, TEXTURE_SIZE, TEXTURE_SIZE, "scan", len(patches)), texture
 
 
 # The parts, in millimetres.
@@ -180,11 +151,6 @@ def _steps(length: float) -> int:
     return max(2, round(length / SPACING))
 
 
-def _square_grid(columns: int, rows: int) -> Array:
-    t, s = np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
-    return np.stack([s, t], -1)
-
-
 def _swept(
     outline: Array,
     profile: Sequence[tuple[float, float]],
@@ -202,7 +168,7 @@ def _swept(
         return place(np.concatenate([plan, at[..., 1:]], -1))
 
     wide, high = _length(outline), _length(side)
-    grid = _square_grid(columns or _steps(wide), _steps(high))
+    grid = square_grid(columns or _steps(wide), _steps(high))
     return Patch(surface, grid, draw(wide, high, DENSITY))
 
 
@@ -247,7 +213,7 @@ def _tube(path: Array, radius: float, place: Surface, draw: Callable[[float, flo
         return place(center(st[..., 0]) + radius * (np.cos(angle) * normal(st[..., 0]) - np.sin(angle) * binormal))
 
     length = _length(path)
-    grid = _square_grid(_steps(length), 10)
+    grid = square_grid(_steps(length), 10)
     return Patch(surface, grid, draw(length, 2 * np.pi * radius, DENSITY))
 
 
@@ -269,123 +235,3 @@ def _tipped(x: float, y: float, z: float) -> Surface:
 
 def _compose(outer: Surface, inner: Surface) -> Surface:
     return lambda p: outer(inner(p))
-
-
-# Assembly.
-
-
-def _pack(shapes: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Top left texel (row, column) of each chart: highest first, each as high up as the charts above it let it."""
-    corners: dict[int, tuple[int, int]] = {}
-    filled = np.full(TEXTURE_SIZE - GAP, GAP)
-    for index in sorted(range(len(shapes)), key=lambda i: -shapes[i][0]):
-        height, width = shapes[index]
-        rows = np.lib.stride_tricks.sliding_window_view(filled[GAP:], width + GAP).max(1)
-        column = GAP + int(rows.argmin())
-        row = int(rows.min())
-        assert row + height + GAP <= TEXTURE_SIZE, "the charts do not fit; lower DENSITY"
-        filled[column : column + width + GAP] = row + height + GAP
-        corners[index] = (row, column)
-    return [corners[index] for index in range(len(shapes))]
-
-
-def _mesh(patches: list[Patch], corners: list[tuple[int, int]]) -> Mesh:
-    """One mesh: positions shared wherever two patches or a patch's own edges meet, uv per patch."""
-    positions, uvs, faces, offset = [], [], [], 0
-    for patch, (row, column) in zip(patches, corners, strict=True):
-        rows, columns = patch.grid.shape[:2]
-        size = np.array(patch.drawing.shape[1::-1], np.float64)
-        positions.append(patch.surface(patch.grid).reshape(-1, 3) / 1000)
-        uvs.append((np.array([column, row]) + patch.grid.reshape(-1, 2) * size) / TEXTURE_SIZE)
-        index = offset + np.arange(rows * columns).reshape(rows, columns)
-        a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
-        faces += [np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)]
-        offset += rows * columns
-    _, first, shared = np.unique(
-        np.rint(np.concatenate(positions) * 1e5).astype(np.int64), axis=0, return_index=True, return_inverse=True
-    )
-    corners_uv = np.concatenate(faces)
-    corners_pos = shared.reshape(-1)[corners_uv]
-    p = np.concatenate(positions)[first]
-    area = np.linalg.norm(
-        np.cross(p[corners_pos[:, 1]] - p[corners_pos[:, 0]], p[corners_pos[:, 2]] - p[corners_pos[:, 0]]), axis=1
-    )
-    solid = area > 1e-9
-    return Mesh(
-        v_pos=torch.from_numpy(p.astype(np.float32)),
-        t_pos_idx=torch.from_numpy(corners_pos[solid].astype(np.int64)),
-        v_uv=torch.from_numpy(np.concatenate(uvs).astype(np.float32)),
-        t_uv_idx=torch.from_numpy(corners_uv[solid].astype(np.int64)),
-    )
-
-
-def _light(mesh: Mesh, patches: list[Patch]) -> list[NDArray[np.float32]]:
-    """Diffuse light with soft shadows on each patch, as images of a factor per SHADE_STEP texels.
-
-    LIGHTS directions over the upper hemisphere, brighter around one side: each adds cosine times visibility, which
-    its own depth image tells.
-    """
-    points, normals, shapes = [], [], []
-    for patch in patches:
-        high, wide = (max(2, side // SHADE_STEP) for side in patch.drawing.shape[:2])
-        t, s = np.meshgrid((np.arange(high) + 0.5) / high, (np.arange(wide) + 0.5) / wide, indexing="ij")
-        st = np.stack([s, t], -1)
-        at = patch.surface(st)
-        right, down = (np.array(step) for step in ((2e-3, 0.0), (0.0, 2e-3)))
-        across = patch.surface(np.clip(st + right, 0, 1)) - patch.surface(np.clip(st - right, 0, 1))
-        along = patch.surface(np.clip(st + down, 0, 1)) - patch.surface(np.clip(st - down, 0, 1))
-        normal = np.cross(along, across)
-        normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
-        points.append(at.reshape(-1, 3) / 1000)
-        normals.append(normal.reshape(-1, 3))
-        shapes.append((high, wide))
-    light = _irradiance(mesh, np.concatenate(points), np.concatenate(normals))
-    bounds = np.cumsum([high * wide for high, wide in shapes])[:-1]
-    return [part.reshape(shape) for part, shape in zip(np.split(light, bounds), shapes, strict=True)]
-
-
-def _irradiance(mesh: Mesh, points: Array, normals: Array) -> NDArray[np.float32]:
-    """Light on points [N,3] (metres) with normals [N,3]: 1 where the brightest unshadowed level surface is."""
-    key = np.array([-0.45, -0.55, 0.7]) / np.linalg.norm([-0.45, -0.55, 0.7])
-    total = np.zeros(len(points), np.float32)
-    level = 0.0
-    size, distance, reach = 480, 4.0, 0.22
-    focal = size / 2 * distance / reach
-    K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]], dtype=torch.float64)
-    for index in range(LIGHTS):
-        z = 0.04 + 0.94 * (index + 0.5) / LIGHTS
-        angle = index * np.pi * (3 - np.sqrt(5))
-        towards = np.array([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z])
-        power = 0.45 + 2.4 * max(0.0, float(towards @ key)) ** 6
-        center = np.array([0, 0, 0.09])
-        world_to_camera = look_at(center + distance * towards, center)
-        camera = Camera(K, torch.from_numpy(world_to_camera), size, size)
-        depth = rasterize(mesh, camera).depth.numpy()
-        depth = np.where(depth > 0, depth, np.inf)
-        raised = points + 0.0015 * normals
-        seen = raised @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
-        pixel = np.clip((seen[:, :2] / seen[:, 2:] * focal + size / 2).astype(np.int64), 0, size - 1)
-        clear = seen[:, 2] <= depth[pixel[:, 1], pixel[:, 0]] + 0.0015
-        total += (power * np.clip(normals @ towards, 0, None) * clear).astype(np.float32)
-        level += power * towards[2]
-    return total / np.float32(level)
-
-
-def look_at(eye: Array, target: Array) -> Array:
-    """world_to_camera [4,4] of a camera at `eye` that looks at `target`, upright in a world whose up is +z."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ eye
-    return matrix
-
-
-def _shaded(drawing: prints.Image, light: NDArray[np.float32]) -> prints.Image:
-    """The drawing under the light: multiplied where numbers are proportional to light, then back to sRGB."""
-    size = (drawing.shape[1], drawing.shape[0])
-    factor = cv2.resize(cv2.GaussianBlur(light, (0, 0), 1.2), size, interpolation=cv2.INTER_LINEAR)
-    # A floor stands for light that bounces between the parts.
-    factor = (0.16 + 0.84 * factor)[..., None]
-    return np.asarray(np.rint(np.clip(drawing * factor ** (1 / 2.2), 0, 255)), np.uint8)

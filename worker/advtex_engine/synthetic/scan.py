@@ -41,6 +41,7 @@ from advtex_engine.render.rasterize import rasterize
 from advtex_engine.render.render_view import render_layers, render_view
 from advtex_engine.results.export import export_model, vertex_normals
 from advtex_engine.synthetic import object as synthetic_object
+from advtex_engine.synthetic.patches import look_at
 from advtex_scan.mesh import MeshSource, parse_mesh
 
 CAMERA_ERROR = 0.002
@@ -252,7 +253,7 @@ def _shots(count: int, width: int, height: int, rng: np.random.Generator, prefix
         distance = DISTANCE * rng.uniform(0.8, 1.15)
         towards = [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
         target = np.array(TARGET) + rng.uniform(-0.015, 0.015, 3)
-        world_to_camera = synthetic_object.look_at(np.array(TARGET) + distance * np.array(towards), target)
+        world_to_camera = look_at(np.array(TARGET) + distance * np.array(towards), target)
         camera = Camera(K, torch.from_numpy(world_to_camera), width, height)
         shots.append(Shot(f"{prefix}-{index:04d}", camera))
     return shots

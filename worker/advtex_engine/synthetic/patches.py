@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from advtex_engine.core.scene import Camera, Mesh
+from advtex_engine.core.scene import Atlas, Camera, Mesh
 from advtex_engine.render.rasterize import rasterize
 from advtex_engine.synthetic import print as prints
 
@@ -28,15 +28,39 @@ LIGHTS = 48
 """Directions that light the scene; each casts a shadow, together they are soft."""
 SHADE_STEP = 4
 """Light is worked out for every so many texels and interpolated."""
+INFRARED_STEP = 4
+"""Texels of the radiance for each of what infrared light meets."""
+GAMMA = 2.2
+"""sRGB values are about this root of light."""
 
 
 @dataclass(frozen=True)
 class Patch:
-    """surface: (s, t) [..., 2] -> millimetres [..., 3]; grid: [R,C,2] (s, t) of the vertices; drawing: [H,W,3]."""
+    """surface: (s, t) [..., 2] -> millimetres [..., 3]; grid: [R,C,2] (s, t) of the vertices; drawing: [H,W,3].
+
+    glow: its light over that of the drawing. gloss, clear: shares of a depth sensor's light that are mirrored and let
+    through.
+    """
 
     surface: Surface
     grid: Array
     drawing: prints.Image
+    glow: float = 1.0
+    gloss: float = 0.0
+    clear: float = 0.0
+
+
+@dataclass(frozen=True)
+class DrawnScene:
+    """A scene as it is, lit.
+
+    radiance: [S,S,3] float32, proportional to light, 1 for white paper where the light is full; a lamp has more.
+    infrared: [S/4,S/4,3] float32, what a depth sensor's light meets: reflectivity, gloss, clearness, each in [0,1].
+    """
+
+    atlas: Atlas
+    radiance: torch.Tensor
+    infrared: torch.Tensor
 
 
 @dataclass(frozen=True)
@@ -70,6 +94,33 @@ def look_at(eye: Array, target: Array) -> Array:
 
 
 # Assembly.
+
+
+def assemble(patches: Sequence[Patch], side: int, sky: Sky) -> DrawnScene:
+    """Patches as a scene with one texture of side x side texels."""
+    corners = pack([patch.drawing.shape[:2] for patch in patches], side)
+    mesh = join(patches, corners, side)
+    lit = [shaded(patch.drawing, shade) for patch, shade in zip(patches, light(mesh, patches, sky), strict=True)]
+    radiance = (torch.from_numpy(paint(lit, corners, side)).float() / 255) ** GAMMA
+    albedo = cv2.resize(
+        paint([patch.drawing for patch in patches], corners, side),
+        None,
+        fx=1 / INFRARED_STEP,
+        fy=1 / INFRARED_STEP,
+        interpolation=cv2.INTER_AREA,
+    )
+    infrared = np.zeros((*albedo.shape[:2], 3), np.float32)
+    infrared[..., 0] = (albedo.mean(-1) / 255) ** GAMMA
+    for patch, (row, column) in zip(patches, corners, strict=True):
+        height, width = patch.drawing.shape[:2]
+        radiance[row - 1 : row + height + 1, column - 1 : column + width + 1] *= patch.glow
+        rows, columns = (
+            slice(first // INFRARED_STEP, (first + size) // INFRARED_STEP + 1)
+            for first, size in ((row, height), (column, width))
+        )
+        if patch.gloss or patch.clear:
+            infrared[rows, columns, 1:] = patch.gloss, patch.clear
+    return DrawnScene(Atlas(mesh, side, side, "scan", len(patches)), radiance, torch.from_numpy(infrared))
 
 
 def pack(shapes: Sequence[tuple[int, int]], side: int) -> list[tuple[int, int]]:
@@ -187,4 +238,4 @@ def shaded(drawing: prints.Image, factor: NDArray[np.float32]) -> prints.Image:
     smooth = cv2.resize(cv2.GaussianBlur(factor, (0, 0), 1.2), size, interpolation=cv2.INTER_LINEAR)
     # A floor stands for light that bounces between the parts.
     smooth = (0.16 + 0.84 * smooth)[..., None]
-    return np.asarray(np.rint(np.clip(drawing * smooth ** (1 / 2.2), 0, 255)), np.uint8)
+    return np.asarray(np.rint(np.clip(drawing * smooth ** (1 / GAMMA), 0, 255)), np.uint8)

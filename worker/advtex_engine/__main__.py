@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -219,14 +219,25 @@ def evaluate(
 def synthesize(
     out: Annotated[Path, typer.Argument(help="folder, or file.zip")],
     views: int = 60,
-    size: Annotated[str, typer.Option(metavar="WxH", help="of the views, pixels")] = "320x240",
+    size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="of the views, pixels", show_default="320x240; real: 640x480")
+    ] = None,
     seed: int = 0,
+    real: Annotated[bool, typer.Option("--real", help="with all that real cameras, sensors and trackers do")] = False,
+    scene: Annotated[Literal["room", "object"], typer.Option(help="with --real: what is scanned")] = "room",
+    sensor: Annotated[Literal["structured", "lidar"], typer.Option(help="with --real: of depth")] = "structured",
 ) -> None:
     """Make a scan with known truth."""
-    from advtex_engine.synthetic.scan import synthesize
+    if real:
+        from advtex_engine.synthetic.real import synthesize_real
 
-    width, height = _pair(size) or (320, 240)
-    synthesize(out, views=views, width=width, height=height, seed=seed)
+        width, height = _pair(size) or (640, 480)
+        synthesize_real(out, scene=scene, sensor=sensor, views=views, width=width, height=height, seed=seed)
+    else:
+        from advtex_engine.synthetic.scan import synthesize
+
+        width, height = _pair(size) or (320, 240)
+        synthesize(out, views=views, width=width, height=height, seed=seed)
     print(out)
 
 

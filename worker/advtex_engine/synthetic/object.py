@@ -26,12 +26,17 @@ SPACING = 4.5
 
 def build(seed: int = 0) -> tuple[Atlas, torch.Tensor]:
     """The object with its atlas, and its texture [TEXTURE_SIZE,TEXTURE_SIZE,3] uint8 sRGB; light is baked in."""
-    patches = list(_patches(np.random.default_rng(seed)))
-    corners = pack([patch.drawing.shape[:2] for patch in patches], TEXTURE_SIZE)
-    mesh = join(patches, corners, TEXTURE_SIZE)
-    lit = [shaded(patch.drawing, shade) for patch, shade in zip(patches, light(mesh, patches, Sky()), strict=True)]
+    parts = patches(seed)
+    corners = pack([patch.drawing.shape[:2] for patch in parts], TEXTURE_SIZE)
+    mesh = join(parts, corners, TEXTURE_SIZE)
+    lit = [shaded(patch.drawing, shade) for patch, shade in zip(parts, light(mesh, parts, Sky()), strict=True)]
     texture = torch.from_numpy(paint(lit, corners, TEXTURE_SIZE))
-    return Atlas(mesh, TEXTURE_SIZE, TEXTURE_SIZE, "scan", len(patches)), texture
+    return Atlas(mesh, TEXTURE_SIZE, TEXTURE_SIZE, "scan", len(parts)), texture
+
+
+def patches(seed: int = 0) -> list[Patch]:
+    """All surfaces of the object; the seed decides what is printed on them."""
+    return list(_patches(np.random.default_rng(seed)))
 
 
 # The parts, in millimetres.

@@ -16,7 +16,7 @@ import numpy as np
 
 from advtex_engine.synthetic import room_print as prints
 from advtex_engine.synthetic.patches import Array, Patch, Sky, square_grid
-from advtex_engine.synthetic.print import Image
+from advtex_engine.synthetic.print import CREAM, Image
 
 WIDTH, DEPTH, HEIGHT = 3600.0, 3000.0, 2500.0
 SPACING = 70.0
@@ -63,7 +63,8 @@ def _panel(
     corner, across, along = np.array(origin), np.array(right), np.array(down)
 
     def surface(st: Array) -> Array:
-        return corner + st[..., :1] * across + st[..., 1:] * along
+        place: Array = corner + st[..., :1] * across + st[..., 1:] * along
+        return place
 
     wide, high = float(np.linalg.norm(across)), float(np.linalg.norm(along))
     grid = square_grid(max(1, round(wide / SPACING)), max(1, round(high / SPACING)))
@@ -149,7 +150,7 @@ def _shelf(rng: np.random.Generator) -> Iterator[Patch]:
         while x < left + wide - 70:
             thick, high = float(rng.uniform(24, 58)), float(rng.uniform(190, 320))
             deep_in = float(rng.uniform(12, 45))
-            plain = partial(prints.plain, color=prints.CREAM)
+            plain = partial(prints.plain, color=CREAM)
             yield from _box(
                 x, back + deep_in, z, (thick, 190.0, high), plain, rng, 0.25, {"front": (prints.spine, 1.3)}
             )

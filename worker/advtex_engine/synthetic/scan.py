@@ -16,13 +16,8 @@ from __future__ import annotations
 
 import io
 import json
-import os
-import shutil
-import tempfile
 import zipfile
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,6 +36,16 @@ from advtex_engine.render.rasterize import rasterize
 from advtex_engine.render.render_view import render_layers, render_view
 from advtex_engine.results.export import export_model, vertex_normals
 from advtex_engine.synthetic import object as synthetic_object
+from advtex_engine.synthetic.files import (
+    TRUTH,
+    intrinsics,
+    new_scan,
+    pose,
+    require_size,
+    thread_per_view,
+    write_ply,
+    write_png,
+)
 from advtex_engine.synthetic.patches import look_at
 from advtex_scan.mesh import MeshSource, parse_mesh
 
@@ -67,8 +72,6 @@ DEPTH_NOISE = 0.001
 """Standard deviation in metres."""
 DEPTH_SCALE = 1000.0
 HELDOUT_VIEWS = 8
-MIN_VIEWS, MIN_SIDE = 3, 16
-TRUTH = "truth/cameras.json"
 BACKDROP = 0.8
 
 
@@ -106,24 +109,12 @@ def synthesize(
     angle that moves the image as far (e_t / DISTANCE). geometry_error: e_g in metres. The same arguments make the same
     scan. Raises OptionError for numbers out of bounds and for a folder that holds something else.
     """
-    if views < MIN_VIEWS or min(width, height) < MIN_SIDE:
-        raise OptionError(f"{views} views of {width}x{height} are too few or too small; at least 3 of 16x16 are needed")
+    require_size(views, width, height)
     errors = Errors(camera_error, camera_error / DISTANCE if camera_turn is None else camera_turn, geometry_error)
     if min(errors.camera, errors.turn, errors.geometry) < 0:
         raise OptionError(f"errors are sizes and must not be negative: {errors}")
-    if out.is_dir() and any(out.iterdir()) and not (out / TRUTH).is_file():
-        raise OptionError(f"{out} holds something else than a synthetic scan; choose another folder or remove it")
-    out.resolve().parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".advtex-synthesize-", dir=out.resolve().parent) as work:
-        folder = Path(work) / "scan"
+    with new_scan(out) as folder:
         _write_scan(folder, views, width, height, seed, errors)
-        if out.suffix == ".zip":
-            _zip_folder(folder, Path(work) / "scan.zip")
-            (Path(work) / "scan.zip").replace(out)
-            return
-        if out.exists():
-            shutil.rmtree(out)
-        folder.rename(out)
 
 
 def compare_to_truth(model: Path, scan: Path) -> dict[str, float]:
@@ -146,7 +137,7 @@ def compare_to_truth(model: Path, scan: Path) -> dict[str, float]:
         )
         return result, original, (seen == 1) & (there == 1)
 
-    with _pool() as pool:
+    with thread_per_view() as pool:
         renders, originals, masks = zip(*pool.map(render, truth["heldout"]), strict=True)
         return score_views(renders, originals, masks)
 
@@ -187,30 +178,30 @@ def _write_scan(folder: Path, views: int, width: int, height: int, seed: int, er
         """Write one frame; its randomness is its own, so that frames may be made in any order."""
         shot, noise = shots[index], np.random.default_rng([seed, index])
         clean = render_view(atlas, texture, shot.camera, supersample=SUPERSAMPLE, background=BACKDROP)
-        _write_png(folder / f"color/{shot.name}.png", _exposed(clean.numpy(), noise))
+        write_png(folder / f"color/{shot.name}.png", _exposed(clean.numpy(), noise))
         depth = rasterize(atlas.mesh, shot.camera).depth.numpy()
-        _write_png(folder / f"depth/{shot.name}.png", _measured(depth, noise))
+        write_png(folder / f"depth/{shot.name}.png", _measured(depth, noise))
 
     def keep(shot: Shot) -> None:
         clean = render_view(atlas, texture, shot.camera, supersample=SUPERSAMPLE, background=BACKDROP)
-        _write_png(folder / f"truth/heldout/{shot.name}.png", np.rint(clean.numpy() * 255).astype(np.uint8))
+        write_png(folder / f"truth/heldout/{shot.name}.png", np.rint(clean.numpy() * 255).astype(np.uint8))
 
-    with _pool() as pool:
+    with thread_per_view() as pool:
         atlas, texture = synthetic_object.build(seed)
         list(pool.map(capture, range(views)))
         list(pool.map(keep, heldout))
-    _write_ply(folder / "mesh.ply", _bent(atlas.mesh, errors.geometry, rng))
+    write_ply(folder / "mesh.ply", _bent(atlas.mesh, errors.geometry, rng))
     scan = {
         "version": 1,
         "kind": "object",
         "up_axis": "+z",
         "depth_scale": DEPTH_SCALE,
-        "color_intrinsics": _intrinsics(shots[0].camera),
-        "depth_intrinsics": _intrinsics(shots[0].camera),
+        "color_intrinsics": intrinsics(shots[0].camera),
+        "depth_intrinsics": intrinsics(shots[0].camera),
         "mesh": "mesh.ply",
         "frames": [
             {"color": f"color/{shot.name}.png", "depth": f"depth/{shot.name}.png"}
-            | _pose(shot.name, _misplaced(camera_to_world(shot.camera).numpy(), errors, rng))
+            | pose(shot.name, _misplaced(camera_to_world(shot.camera).numpy(), errors, rng))
             for shot in shots
         ],
     }
@@ -220,22 +211,10 @@ def _write_scan(folder: Path, views: int, width: int, height: int, seed: int, er
         "width": width,
         "height": height,
         "intrinsics_matrix": shots[0].camera.K.tolist(),
-        "frames": [_pose(shot.name, camera_to_world(shot.camera).numpy()) for shot in shots],
-        "heldout": [_pose(shot.name, camera_to_world(shot.camera).numpy()) for shot in heldout],
+        "frames": [pose(shot.name, camera_to_world(shot.camera).numpy()) for shot in shots],
+        "heldout": [pose(shot.name, camera_to_world(shot.camera).numpy()) for shot in heldout],
     }
     (folder / TRUTH).write_text(json.dumps(truth, indent=1))
-
-
-@contextmanager
-def _pool() -> Iterator[ThreadPoolExecutor]:
-    """One thread per core, each with its own view: a view's tensors are too small to be shared among threads."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            yield pool
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _shots(count: int, width: int, height: int, rng: np.random.Generator, prefix: str, turn: float = 0.0) -> list[Shot]:
@@ -303,47 +282,3 @@ def _bent(mesh: Mesh, error: float, rng: np.random.Generator) -> Mesh:
     for _ in range(LAPLACIAN_STEPS):
         offset = torch.zeros(count).index_add_(0, edges[:, 0], offset[edges[:, 1]]) / degree.clamp(min=1)
     return Mesh(mesh.v_pos + offset[:, None] * vertex_normals(mesh), faces)
-
-
-def _intrinsics(camera: Camera) -> dict[str, float | int]:
-    K = camera.K
-    return {
-        "fx": float(K[0, 0]),
-        "fy": float(K[1, 1]),
-        "cx": float(K[0, 2]),
-        "cy": float(K[1, 2]),
-        "width": camera.width,
-        "height": camera.height,
-    }
-
-
-def _pose(name: str, matrix: NDArray[np.float64]) -> dict[str, Any]:
-    return {"name": name, "camera_to_world": matrix.tolist()}
-
-
-def _write_png(path: Path, image: NDArray[Any]) -> None:
-    done, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
-    assert done
-    path.write_bytes(data.tobytes())
-
-
-def _write_ply(path: Path, mesh: Mesh) -> None:
-    """Binary little-endian PLY."""
-    faces = np.empty(len(mesh.t_pos_idx), dtype=[("count", "u1"), ("index", "<i4", 3)])
-    faces["count"], faces["index"] = 3, mesh.t_pos_idx.numpy()
-    header = (
-        "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(mesh.v_pos)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    path.write_bytes(header.encode() + mesh.v_pos.numpy().astype("<f4").tobytes() + faces.tobytes())
-
-
-def _zip_folder(folder: Path, archive: Path) -> None:
-    """Store the folder's files in sorted order with fixed times, so that the same scan gives the same bytes."""
-    with zipfile.ZipFile(archive, "w") as file:
-        for path in sorted(p for p in folder.rglob("*") if p.is_file()):
-            entry = zipfile.ZipInfo(path.relative_to(folder).as_posix())
-            packed = path.suffix in {".json", ".ply", ".obj", ".mtl"}
-            entry.compress_type = zipfile.ZIP_DEFLATED if packed else zipfile.ZIP_STORED
-            file.writestr(entry, path.read_bytes())

@@ -25,6 +25,10 @@ from advtex_engine.synthetic.patches import GAMMA, Array, DrawnScene
 from advtex_engine.synthetic.trajectory import Path, gaussian_filtered
 
 SUBFRAMES = 16
+# The plastic sequence (Roberts 2018) fills the square evenly; it must not move the picture.
+_SEQUENCE = np.arange(SUBFRAMES)[:, None] * np.array([0.7548776662, 0.5698402910]) % 1
+SHIFTS = _SEQUENCE - _SEQUENCE.mean(0)
+"""Pixels [SUBFRAMES,2] by which the pixel centres of each render lie beside the middle."""
 SHUTTER = 1 / 45
 """Seconds that the median frame is exposed."""
 READOUT = 1 / 40
@@ -33,7 +37,7 @@ DISTORTION = (0.06, -0.12)
 """k1 and k2 of the lens, as OpenCV counts them; the scan does not tell of them."""
 VIGNETTING = 0.5
 """Share of the cosine-fourth law that is left in the corners."""
-KEY = 0.26
+KEY = 0.34
 """The light to which automatic exposure brings the mean of a picture, 1 being white."""
 METER_CLIP = 2.0
 METER_STRENGTH, METER_LAG = 0.75, 0.4
@@ -108,10 +112,8 @@ def expose(scene: DrawnScene, path: Path, camera: Camera, exposure: Exposure, er
     for index in range(SUBFRAMES):
         instant = exposure.middle + exposure.seconds * ((index + 0.5) / SUBFRAMES - 0.5)
         atlas = replace(scene.atlas, mesh=as_seen(scene.atlas.mesh, path, camera, instant, readout, lens))
-        # The plastic sequence (Roberts 2018) spreads the shifts evenly, whatever their number.
-        shift = (np.array([0.7548776662, 0.5698402910]) * (index + 1)) % 1 - 0.5
         K = camera.K.clone()
-        K[:2, 2] += torch.from_numpy(shift)
+        K[:2, 2] += torch.from_numpy(SHIFTS[index])
         there = Camera(K, torch.eye(4, dtype=torch.float64), camera.width, camera.height)
         total += shade(gbuffer(atlas, there, 1), scene.radiance, BACKDROP)
     return (total / SUBFRAMES).numpy()

@@ -20,6 +20,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -115,8 +116,9 @@ def synthesize_real(
         _write(folder, drawn, recording, scene, mesh, [facts for _, facts in taken])
 
 
+@lru_cache(maxsize=1)
 def drawn_scene(scene: SceneName, seed: int) -> DrawnScene:
-    """The room or the object, lit."""
+    """The room or the object, lit. The newest one is kept: it takes as long as many frames, and studies share it."""
     if scene == "room":
         return assemble(room.patches(seed), room.TEXTURE_SIZE, room.SKY)
     return assemble(synthetic_object.patches(seed), synthetic_object.TEXTURE_SIZE, Sky())

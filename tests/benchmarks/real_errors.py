@@ -1,0 +1,161 @@
+"""What each error of real scans costs by itself, and all of them together.
+
+    python tests/benchmarks/real_errors.py [--scenes room object] [--errors all blur ...] [--methods view_selection l1]
+
+Scans as `advtex-engine synthesize --real` makes them, with one error at a time; errors of depth are seen by the mesh
+that is fused, so they come with it. Two LPIPS against the truth: from the true poses, and from those that the tracker
+would have found for the same views, which drift as the mesh does. Cameras are refined if asked for.
+
+Writes real_errors.json (one cell per scene, error and method) and real_errors.md below --results, and per scene and
+method a picture of the truth beside the textures. Stopped and run again, it goes on with the cells that are missing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from harness import (
+    Results,
+    Stopwatch,
+    Truth,
+    common_arguments,
+    configuration,
+    load_truth,
+    markdown_table,
+    mean_of,
+    needed_lpips,
+    parsed_size,
+    prepare,
+    run_method,
+    score_texture,
+    write_report,
+)
+
+from advtex_engine.metrics.lpips import Lpips
+from advtex_engine.render.render_view import render_view
+from advtex_engine.runtime.devices import choose_device
+from advtex_engine.synthetic.camera import Errors
+from advtex_engine.synthetic.files import TRUTH, write_png
+from advtex_engine.synthetic.real import synthesize_real
+
+NONE = Errors.none()
+ALONE = [field.name for field in dataclasses.fields(Errors) if field.name != "depth"]
+ROWS: dict[str, Errors] = {
+    "none": NONE,
+    "all": Errors(),
+    **{name: dataclasses.replace(NONE, **{name: True}) for name in ALONE},
+    "fused, depth": dataclasses.replace(NONE, fused=True, depth=True),
+    "fused, drift": dataclasses.replace(NONE, fused=True, drift=True),
+}
+SCORES = {
+    "lpips": "LPIPS",
+    "lpips_tracked": "LPIPS, tracker's poses",
+    "gradient_ratio": "gradient ratio",
+}
+SHOWN_VIEW = 4
+
+
+def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
+    parser = common_arguments("real_errors", __doc__)
+    parser.add_argument("--scenes", nargs="+", default=["room"], choices=["room", "object"])
+    parser.add_argument("--sensor", default="structured", choices=["structured", "lidar"])
+    parser.add_argument("--errors", nargs="+", default=list(ROWS), choices=ROWS)
+    parser.add_argument("--methods", nargs="+", default=["view_selection"])
+    parsed: argparse.Namespace = parser.parse_args(line)
+    return parsed
+
+
+def settings_of(arguments: argparse.Namespace, scene: str, errors: str, method: str) -> dict[str, Any]:
+    """What a cell is found by."""
+    shared = {name: getattr(arguments, name) for name in ("sensor", "views", "size", "preset", "faces", "refine")}
+    return {"scene": scene, "errors": errors, "method": method, **shared}
+
+
+def tracked(scan: Path, truth: Truth) -> Truth:
+    """The same pictures of the truth, for renders from where the tracker would have placed the cameras."""
+    frames = json.loads((scan / "truth" / "scan.json").read_text())["frames"]
+    matrices = [torch.from_numpy(np.linalg.inv(np.array(frame["camera_to_world"]))) for frame in frames]
+    cameras = [
+        dataclasses.replace(camera, world_to_camera=matrix)
+        for camera, matrix in zip(truth.cameras, matrices, strict=True)
+    ]
+    return dataclasses.replace(truth, cameras=cameras)
+
+
+def fill(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
+    """Runs every cell that is not in the results yet."""
+    width, height = parsed_size(arguments.size)
+    for scene in arguments.scenes:
+        for errors in arguments.errors:
+            settings = {method: settings_of(arguments, scene, errors, method) for method in arguments.methods}
+            if all(results.find(cell) for cell in settings.values()):
+                continue
+            with tempfile.TemporaryDirectory(prefix="advtex-real-errors-") as folder:
+                scan = Path(folder) / "scan"
+                synthesize_real(
+                    scan,
+                    scene=scene,
+                    sensor=arguments.sensor,
+                    views=arguments.views,
+                    width=width,
+                    height=height,
+                    errors=ROWS[errors],
+                )
+                for method, cell in settings.items():
+                    if results.find(cell) is None:
+                        picture = arguments.results / f"{scene}_{method}_{errors.replace(', ', '_')}.png"
+                        _cell(arguments, results, lpips, scan, cell, picture)
+
+
+def _cell(
+    arguments: argparse.Namespace, results: Results, lpips: Lpips, scan: Path, cell: dict[str, Any], picture: Path
+) -> None:
+    device = choose_device(arguments.device)
+    watch = Stopwatch()
+    given = prepare(scan, configuration(arguments, cell["method"]), scan.parent / "work", device)
+    texture = run_method(given, cell["method"])
+    seconds = watch.seconds
+    truth = load_truth(scan)
+    seen = tracked(scan, truth)
+    scores = score_texture(given.atlas, texture, truth, lpips)
+    scores["lpips_tracked"] = score_texture(given.atlas, texture, seen, lpips)["lpips"]
+    told = json.loads((scan / TRUTH).read_text())["frames"]
+    scores["blur_pixels"] = float(np.median([frame["blur_pixels"] for frame in told]))
+    results.add(cell, scores, seconds)
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    render = render_view(given.atlas, texture, seen.cameras[SHOWN_VIEW])
+    shown = torch.cat((truth.images[SHOWN_VIEW], render), 1)
+    write_png(picture, (255 * shown).round().to(torch.uint8).numpy())
+
+
+def report(arguments: argparse.Namespace, results: Results) -> None:
+    """real_errors.md: a table per scene and method, with a row for each error."""
+    body, cells = "", list[dict[str, Any]]()
+    for scene in arguments.scenes:
+        for method in arguments.methods:
+            rows = []
+            for errors in ROWS:
+                cell = results.find(settings_of(arguments, scene, errors, method))
+                if cell is not None:
+                    cells.append(cell)
+                    rows.append([errors, *(mean_of([cell], name) for name in SCORES)])
+            body += f"\n## {scene}, {method}\n\n{markdown_table(['errors', *SCORES.values()], rows)}"
+    write_report(arguments.results / "real_errors.md", "What each error of real scans costs", cells, body)
+
+
+def main(line: list[str] | None = None) -> None:
+    arguments = arguments_of(line)
+    results = Results(arguments.results / "real_errors.json")
+    fill(arguments, results, needed_lpips(arguments.lpips_weights))
+    report(arguments, results)
+
+
+if __name__ == "__main__":
+    main()

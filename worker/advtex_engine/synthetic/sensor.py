@@ -36,7 +36,7 @@ FOCAL_640 = 580.0
 """Focal length of the sensor's camera in pixels of a picture 640 wide, for which the steps of the shift are known."""
 SHIFT_STEP = 1 / 8
 """Pixels: the finest shift that matching tells."""
-SHIFT_NOISE = 0.07
+SHIFT_NOISE = 0.04
 """Standard deviation in pixels, the same over a window."""
 WINDOW = 7
 """Pixels of a picture 640 wide: the side of the windows that are matched."""
@@ -45,9 +45,9 @@ SHIFT_BIAS = 0.1
 NEAREST, FARTHEST = 0.35, 4.5
 GRAZING = 0.17
 """Cosine: what is seen at a more grazing angle sends nothing back."""
-DARKEST = 0.012
+DARKEST = 0.004
 """Reflectivity over squared metres of distance that is still seen, times 1 m^2; black surfaces are lost from afar."""
-MIRRORING = 0.93
+MIRRORING = 0.985
 """Cosine: glossy surfaces that face the sensor more squarely send its own light into it."""
 POINTS = (64, 48)
 """The points of a phone's LiDAR, in columns and rows."""

@@ -4,7 +4,8 @@
 
 Scans as `advtex-engine synthesize --real` makes them, with one error at a time; errors of depth are seen by the mesh
 that is fused, so they come with it. Two LPIPS against the truth: from the true poses, and from those that the tracker
-would have found for the same views, which drift as the mesh does. Cameras are refined if asked for.
+would have found for the same views, which drift as the mesh does; where the mesh has holes, nothing is scored. Cameras
+are refined if asked for.
 
 Writes real_errors.json (one cell per scene, error and method) and real_errors.md below --results, and per scene and
 method a picture of the truth beside the textures. Stopped and run again, it goes on with the cells that are missing.
@@ -30,20 +31,25 @@ from harness import (
     load_truth,
     markdown_table,
     mean_of,
+    moved,
     needed_lpips,
     parsed_size,
     prepare,
     run_method,
-    score_texture,
     write_report,
 )
+from torch import Tensor
 
+from advtex_engine.core.scene import Atlas
+from advtex_engine.metrics.evaluate import Comparison, mean_scores, score
+from advtex_engine.metrics.image_metrics import METRICS
 from advtex_engine.metrics.lpips import Lpips
-from advtex_engine.render.render_view import render_view
+from advtex_engine.render.render_view import render_layers, render_view
 from advtex_engine.runtime.devices import choose_device
 from advtex_engine.synthetic.camera import Errors
 from advtex_engine.synthetic.files import TRUTH, write_png
 from advtex_engine.synthetic.real import synthesize_real
+from advtex_engine.synthetic.scan import SUPERSAMPLE
 
 NONE = Errors.none()
 ALONE = [field.name for field in dataclasses.fields(Errors) if field.name != "depth"]
@@ -58,6 +64,7 @@ SCORES = {
     "lpips": "LPIPS",
     "lpips_tracked": "LPIPS, tracker's poses",
     "gradient_ratio": "gradient ratio",
+    "coverage": "coverage",
 }
 SHOWN_VIEW = 4
 
@@ -124,8 +131,8 @@ def _cell(
     seconds = watch.seconds
     truth = load_truth(scan)
     seen = tracked(scan, truth)
-    scores = score_texture(given.atlas, texture, truth, lpips)
-    scores["lpips_tracked"] = score_texture(given.atlas, texture, seen, lpips)["lpips"]
+    scores = _scores(given.atlas, texture, truth, lpips)
+    scores["lpips_tracked"] = _scores(given.atlas, texture, seen, lpips)["lpips"]
     told = json.loads((scan / TRUTH).read_text())["frames"]
     scores["blur_pixels"] = float(np.median([frame["blur_pixels"] for frame in told]))
     results.add(cell, scores, seconds)
@@ -133,6 +140,20 @@ def _cell(
     render = render_view(given.atlas, texture, seen.cameras[SHOWN_VIEW])
     shown = torch.cat((truth.images[SHOWN_VIEW], render), 1)
     write_png(picture, (255 * shown).round().to(torch.uint8).numpy())
+
+
+def _scores(atlas: Atlas, texture: Tensor, truth: Truth, lpips: Lpips) -> dict[str, float]:
+    """Means over the held-out views, of pixels where both the model and the true scene are; and how many these are."""
+    atlas = dataclasses.replace(atlas, mesh=moved(atlas.mesh, torch.device("cpu")))
+    rows, shares = [], []
+    for camera, image, cover in zip(truth.cameras, truth.images, truth.covers, strict=True):
+        render, seen = render_layers(atlas, texture, camera, supersample=SUPERSAMPLE)
+        mask = cover & (seen == 1)
+        shown = torch.where(mask[..., None], render, image)
+        rows.append(score(Comparison("", image, shown, mask, mask), lpips, METRICS))
+        shares.append(float(mask.sum() / cover.sum()))
+    means = mean_scores([{"view": "", **row} for row in rows])
+    return {"coverage": sum(shares) / len(shares), **{name: means[name] for name in ("lpips", "gradient_ratio")}}
 
 
 def report(arguments: argparse.Namespace, results: Results) -> None:

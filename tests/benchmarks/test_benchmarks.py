@@ -14,6 +14,7 @@ import harness
 import paper
 import parts
 import pytest
+import real_errors
 import scans
 import sparsity
 import study
@@ -21,6 +22,8 @@ import torch
 
 from advtex_engine.adversarial.discriminator import PatchDiscriminator
 from advtex_engine.metrics.lpips import NETWORKS
+from advtex_engine.synthetic import patches
+from advtex_engine.synthetic.real import drawn_scene
 from advtex_engine.synthetic.scan import synthesize
 
 SMALL = ["--views", "6", "--size", "64x64", "--steps", "2", "--faces", "600", "--device", "cpu"]
@@ -287,3 +290,23 @@ def test_real_examples_are_as_far_from_their_sources_as_the_scan_s_errors(
     page = (tmp_path / "out" / "examples.md").read_text()
     assert "| exact | 96x72 |" in page
     assert "| off | 96x72 |" in page
+
+
+@pytest.mark.slow
+def test_real_errors_make_a_table_and_do_nothing_twice(
+    tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn_scene.cache_clear()
+    monkeypatch.setattr(patches, "LIGHTS", 4)
+    line = [*SMALL, "--scenes", "object", "--errors", "none", "drift", "--methods", "mean"]
+    line += ["--lpips-weights", str(weights), "--results", str(tmp_path)]
+    real_errors.main(line)
+    cells = harness.Results(tmp_path / "real_errors.json").cells
+    found = {cell["settings"]["errors"]: cell["scores"] for cell in cells}
+    assert found["none"]["lpips"] == found["none"]["lpips_tracked"]
+    assert found["drift"]["lpips"] != found["drift"]["lpips_tracked"]
+    page = (tmp_path / "real_errors.md").read_text()
+    assert page.index("| none |") < page.index("| drift |")
+    monkeypatch.setattr(real_errors, "synthesize_real", None)
+    real_errors.main(line)
+    drawn_scene.cache_clear()

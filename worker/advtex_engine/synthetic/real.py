@@ -4,8 +4,9 @@ A scan in the native layout, plus `truth/`, which scan readers ignore:
 
     scan.json  color/*.jpg  depth/*.png  mesh.ply     poses as a tracker finds them, the mesh fused from the depth
     truth/object.obj .mtl .png                        the scene as it is, at the exposure of the median frame
-    truth/cameras.json                                the poses as they were; how each frame was taken, and how much
-                                                      of it is blurred and clipped; the camera's lens; the errors
+    truth/cameras.json                                the poses as they were; how each frame was taken, how much of
+                                                      it is blurred and clipped, and the poses from the begin of its
+                                                      first row to the end of its last; the lens; the errors
     truth/heldout/*.png                               sharp views from between the frames, at the median exposure
     truth/scan.json  truth/mesh.ply                   these views as a scan of its own, at the poses that the tracker
                                                       would have found, with the fused mesh: for `evaluate`
@@ -27,6 +28,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from advtex_engine.core.cameras import camera_to_world, pixel_centers, scaled_camera, unproject
@@ -40,6 +42,7 @@ from advtex_engine.synthetic import room
 from advtex_engine.synthetic.camera import (
     BACKDROP,
     DISTORTION,
+    READOUT,
     Errors,
     Exposure,
     automatics,
@@ -75,6 +78,10 @@ HELDOUT_MOVE = 0.05
 """Metres per metre of distance that held-out views lie beside the camera's path, at the most."""
 CLIPPED = 254
 """Levels from which a pixel is counted as clipped."""
+FACTS_STEP = 8
+"""Pixels between those whose blur is looked at."""
+MOTION_POSES = 5
+"""Poses that tell how the camera moved while a frame was taken."""
 
 
 @dataclass(frozen=True)
@@ -184,14 +191,24 @@ def _take(
     write_png(folder / f"depth/{shot.name}.png", stored(depth))
     there = replace(camera, world_to_camera=torch.from_numpy(np.linalg.inv(shot.tracked)))
     frame = DepthFrame(there, torch.from_numpy(stored(depth).astype(np.float32) / np.float32(DEPTH_SCALE)))
-    middle = seen.depth.shape[0] // 8, seen.depth.shape[1] // 8
-    points = unproject(camera, pixel_centers(camera), torch.from_numpy(seen.depth))[seen.depth > 0][:: middle[0]]
-    blur = blur_pixels(recording.path, shot.camera, shot.exposure, points.numpy()) if len(points) else np.zeros(1)
-    facts = {
-        "blur_pixels": round(float(np.median(blur)), 3),
+    return frame, _facts(recording, shot, photo, camera, seen.depth)
+
+
+def _facts(
+    recording: Recording, shot: Shot, photo: NDArray[np.uint8], camera: Camera, depth: NDArray[np.float32]
+) -> dict[str, Any]:
+    """How a frame was taken, where the camera was meanwhile, and what came of it. camera, depth: what it shows."""
+    every = (slice(None, None, FACTS_STEP),) * 2
+    there = torch.from_numpy(depth)[every]
+    points = unproject(camera, pixel_centers(camera)[every], there)[there > 0]
+    blur = blur_pixels(recording.path, shot.camera, shot.exposure, points.numpy())
+    readout = READOUT if recording.errors.rolling_shutter else 0.0
+    instants = shot.exposure.middle + (shot.exposure.seconds + readout) * np.linspace(-0.5, 0.5, MOTION_POSES)
+    return shot.exposure.to_dict() | {
+        "blur_pixels": round(float(np.median(blur)) if len(blur) else 0.0, 3),
         "clipped_share": round(float((photo.max(-1) >= CLIPPED).mean()), 4),
+        "motion": recording.path.poses(instants).tolist(),
     }
-    return frame, shot.exposure.to_dict() | facts
 
 
 def _keep(truth: Path, drawn: DrawnScene, shot: Shot) -> None:
@@ -223,6 +240,7 @@ def _write(
         "height": shots[0].camera.height,
         "intrinsics_matrix": shots[0].camera.K.tolist(),
         "lens": list(DISTORTION) if errors.distortion else [0.0, 0.0],
+        "readout_seconds": READOUT if errors.rolling_shutter else 0.0,
         "errors": asdict(errors),
         "gain": heldout[0].exposure.gain,
         "frames": [_true_pose(shot) | fact for shot, fact in zip(shots, facts, strict=True)],

@@ -78,6 +78,7 @@ class Sky:
 
 
 def square_grid(columns: int, rows: int) -> Array:
+    """(s, t) [rows+1,columns+1,2] of evenly spaced vertices over the unit square."""
     t, s = np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
     return np.stack([s, t], -1)
 
@@ -91,9 +92,6 @@ def look_at(eye: Array, target: Array) -> Array:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ eye
     return matrix
-
-
-# Assembly.
 
 
 def assemble(patches: Sequence[Patch], side: int, sky: Sky) -> DrawnScene:

@@ -112,6 +112,13 @@ def test_lidar_has_no_holes_but_runs_edges_together_and_loses_thin_things() -> N
     assert found[:, 40].min() > 2.3
 
 
+def test_the_lidar_s_errors_grow_with_the_distance() -> None:
+    for distance in (0.4, 3.0):
+        off = np.stack([measure(facing(distance), CAMERA, "lidar", 0, frame) for frame in range(8)]) / distance - 1
+        assert 0.5 < (off - off.mean(0)).std() / module.LIDAR_NOISE < 1.5
+        assert 0.2 < off.mean(0).std() / module.LIDAR_SCALE < 2
+
+
 def test_the_lidar_s_image_is_small() -> None:
     big = pinhole(640, 480, 550.0)
     small = depth_camera(big, "lidar")

@@ -53,8 +53,8 @@ POINTS = (64, 48)
 """The points of a phone's LiDAR, in columns and rows."""
 LIDAR_SIZE = 256
 """Columns of its depth image."""
-LIDAR_SCALE, LIDAR_NOISE = 0.006, 0.008
-"""Root mean square of its smooth errors: a share of the distance, the same in every frame; metres, of each frame."""
+LIDAR_SCALE, LIDAR_NOISE = 0.006, 0.0045
+"""Root mean square of its smooth errors as shares of the distance: the same in every frame, and of each frame."""
 LIDAR_FARTHEST = 5.0
 
 
@@ -149,8 +149,8 @@ def _lidar(seen: Seen, device: np.random.Generator, noise: np.random.Generator) 
     size = (shape[1], shape[0])
     share = cv2.resize(weight, size, interpolation=cv2.INTER_LINEAR)
     depth = cv2.resize(sparse * weight, size, interpolation=cv2.INTER_LINEAR) / np.maximum(share, 1e-6)
-    depth = depth * (1 + LIDAR_SCALE * _smooth(shape, device, shape[1] / 3))
-    depth = depth + LIDAR_NOISE * _smooth(shape, noise, shape[1] / 16)
+    off = LIDAR_SCALE * _smooth(shape, device, shape[1] / 3) + LIDAR_NOISE * _smooth(shape, noise, shape[1] / 16)
+    depth = depth * (1 + off)
     return np.asarray(np.where(share > 0.5, np.maximum(depth, 1 / DEPTH_SCALE), 0), np.float32)
 
 

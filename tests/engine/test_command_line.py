@@ -38,6 +38,15 @@ def test_usage_is_2_and_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert words in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("flags", [("--scene", "room"), ("--sensor", "lidar")])
+def test_what_only_real_scans_have_is_refused_for_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: tuple[str, str]
+) -> None:
+    assert main(["synthesize", str(tmp_path / "scan"), *flags]) == 2
+    assert "give --real too" in capsys.readouterr().err
+    assert not (tmp_path / "scan").exists()
+
+
 def test_what_cannot_be_read_is_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", str(tmp_path / "none")]) == 1
     assert "none" in capsys.readouterr().err

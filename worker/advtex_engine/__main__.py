@@ -224,15 +224,22 @@ def synthesize(
     ] = None,
     seed: int = 0,
     real: Annotated[bool, typer.Option("--real", help="with all that real cameras, sensors and trackers do")] = False,
-    scene: Annotated[Literal["room", "object"], typer.Option(help="with --real: what is scanned")] = "room",
-    sensor: Annotated[Literal["structured", "lidar"], typer.Option(help="with --real: of depth")] = "structured",
+    scene: Annotated[
+        Literal["room", "object"] | None, typer.Option(help="with --real: what is scanned", show_default="room")
+    ] = None,
+    sensor: Annotated[
+        Literal["structured", "lidar"] | None, typer.Option(help="with --real: of depth", show_default="structured")
+    ] = None,
 ) -> None:
     """Make a scan with known truth."""
     if real:
         from advtex_engine.synthetic.real import synthesize_real
 
         width, height = _pair(size) or (640, 480)
+        scene, sensor = scene or "room", sensor or "structured"
         synthesize_real(out, scene=scene, sensor=sensor, views=views, width=width, height=height, seed=seed)
+    elif scene is not None or sensor is not None:
+        raise typer.BadParameter("--scene and --sensor are of scans with the errors of real ones; give --real too")
     else:
         from advtex_engine.synthetic.scan import synthesize
 

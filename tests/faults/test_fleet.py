@@ -11,7 +11,7 @@ from pathlib import Path
 import boto3
 import pytest
 from chaos import check_outcome, insist
-from fleet import Fleet, Place, fleet, kill_tree
+from live_fleet import Fleet, Place, fleet, kill_tree
 from live_service import process_tree, wait_until
 from tiny_scan import write_zip
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from chaos import Chaos, check_outcome, insist
-from fleet import Fleet, Place, fleet
+from live_fleet import Fleet, Place, fleet
 from live_service import wait_until
 from tiny_scan import write_zip
 

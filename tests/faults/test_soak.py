@@ -17,7 +17,7 @@ import httpx
 import psutil
 import pytest
 from chaos import LEASE_SECONDS, check_outcome, insist
-from fleet import Fleet, Place, fleet, kill_tree
+from live_fleet import Fleet, Place, fleet, kill_tree
 from live_service import process_tree, wait_until
 from tiny_scan import write_zip
 

@@ -20,7 +20,7 @@ import fake_engines
 import httpx
 import pytest
 from attempts import result
-from fleet import Fleet, Place, is_up, kill_tree
+from live_fleet import Fleet, Place, is_up, kill_tree
 from live_service import wait_until
 from releases import PRESENT, Release, checked_out
 from tiny_scan import write_zip

@@ -19,7 +19,7 @@ import httpx
 import psutil
 import pytest
 from cutting_proxy import BUFFER, CuttingProxy
-from fleet import Place, fleet
+from live_fleet import Place, fleet
 from live_service import LiveService, wait_until
 
 from advtex_client import Client

@@ -16,7 +16,7 @@ from itertools import pairwise
 
 import fake_engines
 import httpx
-from fleet import Fleet, is_up, kill_tree
+from live_fleet import Fleet, is_up, kill_tree
 from live_service import process_tree
 
 from advtex_contract.jobs import TERMINAL, JobState

@@ -7,6 +7,7 @@ import os
 import random
 import shutil
 import signal
+import subprocess
 import threading
 import time
 from collections import defaultdict
@@ -96,11 +97,11 @@ class Chaos:
 
     def kill_server(self) -> None:
         """With its dispatcher."""
-        self._random.choice(self._fleet.servers).kill()
+        _kill(self._random.choice(self._fleet.servers))
 
     def kill_worker(self) -> None:
         """RQ's parent alone."""
-        self._random.choice(self._fleet.workers).kill()
+        _kill(self._random.choice(self._fleet.workers))
 
     def kill_runner(self) -> None:
         """The deepest process of a worker: the runner if there is one, else the work-horse."""
@@ -110,15 +111,16 @@ class Chaos:
                 os.kill(self._random.choice(tree[1:]), signal.SIGKILL)
 
     def kill_tree_of_worker(self) -> None:
-        kill_tree(self._random.choice(self._fleet.workers).pid)
+        worker = self._random.choice(self._fleet.workers)
+        kill_tree(worker.pid)
+        worker.wait()
 
     def restart_redis(self) -> None:
-        self._fleet.redis.kill()
+        _kill(self._fleet.redis)
         self._pause(0.0, 2.0)
 
     def empty_redis(self) -> None:
-        self._fleet.redis.kill()
-        self._fleet.redis.wait()
+        _kill(self._fleet.redis)
         for path in self._fleet.redis_folder.iterdir():
             path.unlink()
 
@@ -161,6 +163,12 @@ class Chaos:
         fleet.workers = [
             fleet.start_worker(n) if worker.poll() is not None else worker for n, worker in enumerate(fleet.workers)
         ]
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """Until it is gone: one that is still going would not be started again."""
+    process.kill()
+    process.wait()
 
 
 def insist(fleet: Fleet, key: str, method: str, path: str, **request: object) -> httpx.Response:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -192,3 +193,10 @@ def test_packing_in_a_child_is_packing(monkeypatch: pytest.MonkeyPatch) -> None:
     ((here, here_side),) = pack_charts([(charts.uv, charts.faces)], Monitor())
     assert side == here_side
     assert np.array_equal(texel, here)
+
+
+def test_a_child_starts_without_torch() -> None:
+    """It takes seconds and hundreds of MB to import, and a mesh may have dozens of children."""
+    told = "import sys, advtex_engine.runtime.children, advtex_engine.atlas.charting; print('torch' in sys.modules)"
+    ran = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, check=True)
+    assert ran.stdout == "False\n"

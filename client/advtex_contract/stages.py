@@ -9,7 +9,7 @@ STAGE_LABELS: Mapping[str, str] = {
     "conventions": "Measuring conventions",
     "fusion": "Fusing depth into a mesh",
     "geometry": "Cleaning the mesh",
-    "refinement": "Refining cameras",
+    "refinement": "Refining cameras and geometry",
     "atlas": "Laying out the texture",
     "view_maps": "Mapping views to texels",
     "initial_texture": "First texture",

@@ -41,7 +41,7 @@ from advtex_engine.methods.view_selection import select_views
 from advtex_engine.metrics.evaluate import PATCH_METRICS, VIEW_METRICS, Comparison, evaluate, score
 from advtex_engine.metrics.lpips import Lpips, WeightsError, load_lpips
 from advtex_engine.previews.live import Live
-from advtex_engine.refine.run import apply_refinement, refine_cameras
+from advtex_engine.refine.run import apply_refinement, refine_scene
 from advtex_engine.render.pictures import contact_sheet
 from advtex_engine.render.render_view import render_layers, render_view
 from advtex_engine.render.texture import fill_holes
@@ -108,14 +108,14 @@ def load_truth(scan: Path) -> Truth:
 
 
 def prepare(scan: Path, config: TextureConfig, work: Path, device: torch.device, every: int = 1) -> MethodInput:
-    """A scan as methods take it: every `every`-th view, cameras refined where the configuration says so."""
+    """A scan as methods take it: every `every`-th view, refined where the configuration says so."""
     monitor = Monitor()
     scene = ingest(scan, config, monitor)
     scene = dataclasses.replace(
         scene, views=scene.views[::every], mesh=decimate(clean(scene.mesh), config.face_budget, monitor)
     )
     if config.refines:
-        scene = apply_refinement(scene, refine_cameras(scene, device, config.seed))
+        scene = apply_refinement(scene, refine_scene(scene, device, config.seed))
     atlas = build_atlas(scene.mesh, [view.camera for view in scene.views], config, monitor)
     atlas = dataclasses.replace(atlas, mesh=moved(atlas.mesh, device))
     maps = build_view_maps(atlas, scene.views, scene.kind)

@@ -75,6 +75,12 @@ def misplaced(scene: Scene, pixels: float) -> Scene:
     return replace(scene, views=tuple(views))
 
 
+def scattered(position: Tensor, normal: Tensor) -> Candidates:
+    """Points of no face in particular."""
+    count = len(position)
+    return Candidates(position, normal, torch.ones(count), torch.zeros(count).long(), torch.zeros(count, 3).double())
+
+
 def errors(scene: Scene, truth: Scene) -> Tensor:
     """[V] pixels that the relief's vertices are off, without the common motion that nobody can know."""
     poses, true = (torch.stack([v.camera.world_to_camera for v in s.views]) for s in (scene, truth))
@@ -318,7 +324,7 @@ def test_the_solver_agrees_with_dense_least_squares(anchored: bool) -> None:
 def test_the_pose_jacobian_agrees_with_differences(true_scene: Scene) -> None:
     cameras, depths = surface_depths(true_scene.mesh, true_scene.views[:2], (WIDTH, HEIGHT), "scene")
     vertices = true_scene.mesh.v_pos.double()
-    candidates = Candidates(vertices, torch.tensor([0.0, 0, 1]).double().expand_as(vertices), torch.ones(len(vertices)))
+    candidates = scattered(vertices, torch.tensor([0.0, 0, 1]).double().expand_as(vertices))
     points = observe(candidates, torch.arange(len(vertices)), cameras, depths, 400)
     K = torch.stack([camera.K for camera in cameras])
     poses = torch.stack([camera.world_to_camera for camera in cameras])
@@ -350,7 +356,7 @@ def test_points_behind_something_and_near_its_outline_are_not_observed() -> None
     # On the card; on the wall behind it; just beside its outline as seen from here; well beside.
     position = torch.tensor([[0.0, 0, 1], [0, 0, 2], [0.42, 0, 2], [0.7, 0, 2]], dtype=torch.float64)
     normal = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand_as(position)
-    points = observe(Candidates(position, normal, torch.ones(4)), torch.arange(4), cameras, depths, 10)
+    points = observe(scattered(position, normal), torch.arange(4), cameras, depths, 10)
     seen = points.position[points.point[points.seen]]
     assert seen.tolist() == [[0.0, 0, 1], [0.7, 0, 2]]
     assert int(points.seen.sum()) == 2

@@ -18,8 +18,9 @@ from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 
 from advtex_engine.core.scene import TO_Y_UP, Atlas, Camera, Mesh
+from advtex_engine.mesh.normals import vertex_normals
 from advtex_engine.render.render_view import render_layers
-from advtex_engine.results.export import encode_png, export_model, vertex_normals
+from advtex_engine.results.export import encode_png, export_model
 from advtex_engine.runtime.files import atomic_file, write_atomically
 
 VALIDATOR = Path(__file__).parents[1] / "gltf_validator"

@@ -24,8 +24,9 @@ from advtex_engine.core.errors import OptionError
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Atlas, Mesh
 from advtex_engine.ingest.read import ingest
+from advtex_engine.mesh.normals import vertex_normals
 from advtex_engine.render.rasterize import rasterize
-from advtex_engine.results.export import export_model, vertex_normals
+from advtex_engine.results.export import export_model
 from advtex_engine.synthetic import object as synthetic_object
 from advtex_engine.synthetic import patches
 from advtex_engine.synthetic import scan as module

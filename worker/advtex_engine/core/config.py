@@ -163,7 +163,7 @@ class TextureConfig(Options):
     size              working size (width, height) of the views in pixels; None keeps the scan's
     max_views         of a longer scan, these many frames are chosen; fewer where their maps would not fit into memory
     memory_bytes      what the run may take of a GPU that others use too; None: all that is free
-    refine            cameras and exposures are refined first; never for the preset "paper", which has no such stage
+    refine            cameras, exposures and vertices are refined first; never for the preset "paper", which does not
     """
 
     face_budget: int = FACE_BUDGET

@@ -43,11 +43,24 @@ class Observations:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Surface points that at least two views see: position and normal [N,3] float64 (world), and detail [N] >= 0."""
+    """Surface points that at least two views see: position and normal [N,3] float64 (world), and detail [N] >= 0.
+
+    face: [N] int64, where each lies. weights: [N,3] float64, of the face's corners.
+    """
 
     position: Tensor
     normal: Tensor
     detail: Tensor
+    face: Tensor
+    weights: Tensor
+
+    def chosen(self, rows: Tensor) -> Candidates:
+        """Some of them, by rows [M] int64 or [N] bool."""
+        return Candidates(*(part[rows] for part in vars(self).values()))
+
+    def on(self, mesh: Mesh) -> Tensor:
+        """The same points of a mesh whose vertices have moved, [N,3] float64."""
+        return (mesh.v_pos.double()[mesh.t_pos_idx[self.face]] * self.weights[..., None]).sum(1)
 
 
 def surface_depths(
@@ -108,8 +121,8 @@ def draw_candidates(
     for view, (seen, pixel) in enumerate(_looks(position, unit, cameras, depths)):
         total.index_add_(0, seen, detail[view].flatten()[pixel].double())
         count[seen] += 1
-    shared = count >= 2
-    return Candidates(position[shared], unit[shared], total[shared] / count[shared])
+    detail_of = total / count.clamp(min=1)
+    return Candidates(position, unit, detail_of, face.to(device), weights.to(device)).chosen(count >= 2)
 
 
 def observe(candidates: Candidates, chosen: Tensor, cameras: list[Camera], depths: Tensor, most: int) -> Observations:
@@ -134,8 +147,12 @@ def order_of_preference(candidates: Candidates, generator: torch.Generator) -> T
 
 def surface_cells(candidates: Candidates, depths: Tensor) -> Tensor:
     """[N] int64: the cell of a grid in space, CELL_SIZE of the median of `depths` wide, that each point lies in."""
-    side = CELL_SIZE * depths[depths > 0].median().double()
-    cell: Tensor = torch.unique((candidates.position / side).floor().long(), dim=0, return_inverse=True)[1]
+    return grid_cells(candidates.position, depths[depths > 0].median().double())
+
+
+def grid_cells(position: Tensor, depth: Tensor | float) -> Tensor:
+    """[N] int64: the cell of a grid in space, CELL_SIZE of this depth wide, that each position [N,3] lies in."""
+    cell: Tensor = torch.unique((position / (CELL_SIZE * depth)).floor().long(), dim=0, return_inverse=True)[1]
     return cell
 
 

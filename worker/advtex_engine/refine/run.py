@@ -27,6 +27,7 @@ from advtex_engine.ingest.depth import depth_in_color_image
 from advtex_engine.mesh.registration import register_camera
 from advtex_engine.refine.check import better, disagreement, improved
 from advtex_engine.refine.exposure import corrected_color, fit_exposure, sample_colors
+from advtex_engine.refine.geometry import refine_geometry
 from advtex_engine.refine.points import Observations
 from advtex_engine.refine.pose import keep_gauge, refine_poses, sample_points
 from advtex_engine.refine.rig import Device, refine_device
@@ -34,6 +35,7 @@ from advtex_engine.refine.working_views import CONTRAST_SCALE, WorkingViews, mot
 from advtex_engine.runtime.threads import in_threads, one_thread_each
 
 COLOR_SCALE = 0.1  # disagreements beyond twice that are highlights
+ROUNDS = 2
 DEVICE_POINTS = 1250  # per view
 DEVICE_MARGIN = 0.9  # of the disagreement may be left for a correction of the device to be taken
 
@@ -44,7 +46,7 @@ class Refinement:
 
     world_to_camera: [V,4,4] float64. gain, offset: [V,3] float32, corrected color = gain * color + offset in [0,1].
     lens [3,3] and device_offset [4,4]: the `Device` that all frames share, at their full size; None if as given. The
-    poses of training views hold the offset already.
+    poses of training views hold the offset already. v_pos: [M,3] float32, the mesh's vertices; None if as given.
     """
 
     world_to_camera: Tensor
@@ -53,6 +55,7 @@ class Refinement:
     report: dict[str, Any]
     lens: Tensor | None = None
     device_offset: Tensor | None = None
+    v_pos: Tensor | None = None
 
 
 def refinement_to_dict(refinement: Refinement) -> dict[str, Any]:
@@ -63,6 +66,25 @@ def refinement_to_dict(refinement: Refinement) -> dict[str, Any]:
 def refinement_from_dict(saved: Mapping[str, Any]) -> Refinement:
     """Inverse of `refinement_to_dict`; other keys are ignored."""
     return Refinement(**{key: saved[key] for key in Refinement.__dataclass_fields__ if key in saved})
+
+
+def refine_scene(scene: Scene, device: torch.device, seed: int) -> Refinement:
+    """Cameras and exposures, and then the geometry; where that has moved, both once more: each was found beside what
+    was wrong with the other."""
+    refinement = refine_cameras(scene, device, seed)
+    rounds = list[dict[str, Any]]()
+    while len(rounds) < ROUNDS:
+        refined = apply_refinement(scene, refinement)
+        if rounds:
+            again = refine_cameras(refined, device, seed)
+            refinement = replace(refinement, world_to_camera=again.world_to_camera)
+            refined = apply_refinement(scene, refinement)
+        geometry = refine_geometry(refined, device, seed)
+        rounds.append(geometry.report)
+        if geometry.v_pos is None:
+            break
+        refinement = replace(refinement, v_pos=geometry.v_pos)
+    return replace(refinement, report={**refinement.report, "geometry": rounds})
 
 
 def refine_cameras(scene: Scene, device: torch.device, seed: int) -> Refinement:
@@ -106,7 +128,7 @@ def refine_cameras(scene: Scene, device: torch.device, seed: int) -> Refinement:
 
 
 def apply_refinement(scene: Scene, refinement: Refinement) -> Scene:
-    """The scene with its training views' cameras moved and their colors corrected.
+    """The scene with its training views' cameras moved, their colors corrected, and its vertices moved.
 
     Held-out views are as they came but for a correction of the device.
     """
@@ -124,7 +146,8 @@ def apply_refinement(scene: Scene, refinement: Refinement) -> Scene:
     found = (refinement.world_to_camera, refinement.gain, refinement.offset)
     with one_thread_each():
         views = tuple(in_threads(refined, zip(given, *found, strict=True)))
-    return replace(scene, views=views, heldout=heldout)
+    mesh = scene.mesh if refinement.v_pos is None else replace(scene.mesh, v_pos=refinement.v_pos)
+    return replace(scene, mesh=mesh, views=views, heldout=heldout)
 
 
 def _unmoved(scene: Scene) -> Refinement:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -64,10 +65,8 @@ def working_views(
     """None when hardly anything is seen by two views."""
     generator = torch.Generator().manual_seed(seed)
     mesh = Mesh(mesh.v_pos.to(device), mesh.t_pos_idx.to(device))
-    camera = views[0].camera
-    width = min(WORKING_WIDTH, camera.width)
-    size = (width, max(1, round(camera.height * width / camera.width)))
-    color = torch.cat([_shrunk(view.color.to(device), size) for view in views])
+    color = working_color(views, device)
+    size = (color.shape[3], color.shape[2])
     features = local_contrast(luminance(color), 1)
     cameras, depths = surface_depths(mesh, views, size, kind)
     K, given = stack_cameras(cameras, device)
@@ -81,6 +80,14 @@ def working_views(
     fitted = observe(candidates, order[~aside], cameras, depths, POINTS_PER_VIEW)
     spread = observe(candidates, order[::SPREAD_STRIDE], cameras, depths, POINTS_PER_VIEW // 4)
     return WorkingViews(color, features, K, given, fitted, spread, checked, cell[aside])
+
+
+def working_color(views: Sequence[View], device: torch.device) -> Tensor:
+    """The views' photographs at the working size, [V,3,h,w] float32 in [0,1]."""
+    camera = views[0].camera
+    width = min(WORKING_WIDTH, camera.width)
+    size = (width, max(1, round(camera.height * width / camera.width)))
+    return torch.cat([_shrunk(view.color.to(device), size) for view in views])
 
 
 def luminance(color: Tensor) -> Tensor:

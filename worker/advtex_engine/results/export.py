@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from advtex_engine.core.scene import TO_Y_UP, Atlas, Mesh
+from advtex_engine.mesh.normals import vertex_normals
 from advtex_engine.runtime.files import atomic_file, write_atomically
 
 Array = NDArray[Any]
@@ -87,19 +88,6 @@ def _split_pages(atlas: Atlas, texture: Tensor) -> list[_Page]:
         part = Mesh(mesh.v_pos, mesh.t_pos_idx[mine], v_uv, mesh.t_uv_idx[mine])
         pages.append(_Page(part, encode_png(image), f"_{len(pages) + 1}" if pages else ""))
     return pages
-
-
-def vertex_normals(mesh: Mesh) -> Tensor:
-    """Smooth unit normals [V,3] float32: face normals weighted by area; +z where a vertex has no area around it."""
-    v_pos = mesh.v_pos.double()
-    a, b, c = (v_pos[mesh.t_pos_idx[:, corner]] for corner in range(3))
-    twice_area = torch.linalg.cross(b - a, c - a)
-    total = torch.zeros_like(v_pos)
-    for corner in range(3):
-        total.index_add_(0, mesh.t_pos_idx[:, corner], twice_area)
-    length = total.norm(dim=1, keepdim=True)
-    upwards = total.new_tensor([0.0, 0.0, 1.0])
-    return torch.where(length > 0, total / length.clamp(min=torch.finfo(torch.float64).tiny), upwards).float()
 
 
 def encode_png(texture: Tensor) -> bytes:

@@ -1,4 +1,4 @@
-"""Cameras and exposures refined by the photographs, from the work folder or found anew."""
+"""Cameras, exposures and geometry refined by the photographs, from the work folder or found anew."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from advtex_engine.core.scene import Scene
 from advtex_engine.refine.run import (
     Refinement,
     apply_refinement,
-    refine_cameras,
+    refine_scene,
     refinement_from_dict,
     refinement_to_dict,
 )
@@ -18,7 +18,7 @@ from advtex_engine.runtime.stage_records import Stages
 
 
 def refined_scene(scene: Scene, stages: Stages, device: torch.device, seed: int) -> tuple[Scene, dict[str, Any]]:
-    """The scene with refined cameras and exposures, and the report's part about them.
+    """The scene with refined cameras, exposures and vertices, and the report's part about them.
 
     What was found is small and cached by itself: the scene as it came stays in its own cache.
     """
@@ -28,7 +28,7 @@ def refined_scene(scene: Scene, stages: Stages, device: torch.device, seed: int)
         refinement = refinement_from_dict(saved)
         return apply_refinement(scene, refinement), refinement.report
     with stages.run("refinement"):
-        refinement = refine_cameras(scene, device, seed)
+        refinement = refine_scene(scene, device, seed)
         refined = apply_refinement(scene, refinement)
     stages.folder.save("refinement", refinement_to_dict(refinement))
     stages.save()

@@ -30,11 +30,12 @@ from numpy.typing import NDArray
 from advtex_engine.core.cameras import camera_to_world
 from advtex_engine.core.errors import OptionError
 from advtex_engine.core.scene import Atlas, Camera, Mesh
+from advtex_engine.mesh.normals import vertex_normals
 from advtex_engine.mesh.read import NUMPY, to_mesh
 from advtex_engine.metrics.image_metrics import score_views
 from advtex_engine.render.rasterize import rasterize
 from advtex_engine.render.render_view import render_layers, render_view
-from advtex_engine.results.export import export_model, vertex_normals
+from advtex_engine.results.export import export_model
 from advtex_engine.synthetic import object as synthetic_object
 from advtex_engine.synthetic.files import (
     TRUTH,

@@ -1,0 +1,221 @@
+"""Geometry refinement: vertices move along their normals to where the photographs agree and the depth was measured.
+
+Photographs from several sides show a surface that lies too far in or out in different places (the parallax; Vu et al.
+2012, "High Accuracy and Visibility-Consistent Dense Multiview Stereo"), and the depth images of all frames together
+know it better than a mesh that was made of few of them, or came from elsewhere. Both are linear in how far a surface
+point moves along its normal, which is the mean of the offsets d of its face's corners:
+    sum over points (a d^2 - 2 b d) + smoothness of d between neighboring vertices
+is minimized by conjugate gradients, again and again as the images get finer. It is the offsets that are smooth, not the
+surface: what is an edge stays one.
+
+Nothing is taken on trust: the photographs have no say in cells of the surface that were set aside, and the mesh stays
+as it came unless they agree better there afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from advtex_engine.core.cameras import stack_cameras
+from advtex_engine.core.scene import Mesh, Scene
+from advtex_engine.mesh.normals import vertex_normals
+from advtex_engine.refine.check import MARGIN, better, disagreement
+from advtex_engine.refine.points import (
+    Candidates,
+    Observations,
+    draw_candidates,
+    grid_cells,
+    observe,
+    order_of_preference,
+    surface_depths,
+)
+from advtex_engine.refine.pose import ROBUST_SCALE, local_contrast, sample_points
+from advtex_engine.refine.solve import residuals, weighted_mean
+from advtex_engine.refine.working_views import CHECKED_SHARE, CONTRAST_SCALE, luminance, working_color
+
+LEVELS = ((4, 3), (2, 3), (1, 3))  # shrink factor of the image, Gauss-Newton steps
+POINTS_PER_VIEW = 20_000
+MIN_POINTS = 1000  # that two views must see, to move anything
+SMOOTH, SMALL = 0.3, 0.01  # pulls to the neighbors' offsets and to 0, relative to the mean evidence for a vertex
+# Readings of one place err together, so that many are hardly more evidence than a few.
+DEPTH_WEIGHT = 0.2
+LEAST_DEVIATION = 0.001  # metres, of the depth's readings
+LARGEST_STEP = 3.0  # pixels of the level
+MOST = 0.04  # of the median depth
+SOLVER_STEPS = 60
+
+
+@dataclass(frozen=True)
+class GeometryRefinement:
+    """v_pos [V,3] float32, None to leave the mesh as it came; and the report about it."""
+
+    v_pos: Tensor | None
+    report: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Points of the surface and the views that look at them. measured: [V,K] metres along z, 0 = no reading."""
+
+    surface: Candidates
+    points: Observations
+    measured: Tensor
+
+
+def refine_geometry(scene: Scene, device: torch.device, seed: int) -> GeometryRefinement:
+    """Vertices along their normals, from the training views' photographs and depth; held-out views are not read.
+
+    On a CPU the same input and seed give the same result. Not differentiable.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    color = working_color(scene.views, device)
+    given = _Surface(Mesh(scene.mesh.v_pos.to(device), scene.mesh.t_pos_idx.to(device)), scene, color, generator)
+    offsets = torch.zeros(len(given.mesh.v_pos), device=device)
+    taken, report = False, dict[str, Any]()
+    first = given.look(given.mesh)
+    for scale, steps in LEVELS:
+        seen = given.look(given.moved(offsets)) if report else first
+        if first is None or seen is None:
+            break
+        features = local_contrast(luminance(color), scale)
+        for _ in range(steps):
+            offsets = given.step(offsets, features, seen, scale)
+        taken, report = given.judged(given.moved(offsets), first)
+        if report["residual_after"] > MARGIN * report["residual_before"]:  # what begins like that comes to nothing
+            break
+    report = {"refined": taken, **report}
+    if not taken:
+        return GeometryRefinement(None, report)
+    report["moved_mm"] = round(1000 * float(offsets.abs().mean()), 3)
+    return GeometryRefinement(given.moved(offsets).v_pos.cpu(), report)
+
+
+class _Surface:
+    """The mesh as it came, what its photographs show, and what moves it."""
+
+    def __init__(self, mesh: Mesh, scene: Scene, color: Tensor, generator: torch.Generator) -> None:
+        self.mesh, self._scene, self._generator = mesh, scene, generator
+        self._normal = vertex_normals(mesh)
+        self._size = (color.shape[3], color.shape[2])
+        self._features = local_contrast(luminance(color), 1)
+        self._cameras, self._depths = cameras, depths = surface_depths(mesh, scene.views, self._size, scene.kind)
+        self._K, self._poses = stack_cameras(cameras, mesh.v_pos.device)
+        self._depth = float(depths[depths > 0].median()) if bool((depths > 0).any()) else 1.0
+        sides = torch.cat([mesh.t_pos_idx[:, [a, b]] for a, b in ((0, 1), (1, 2), (2, 0))]).sort(1).values
+        self._edges = torch.unique(sides, dim=0)
+        self._cell = grid_cells(mesh.v_pos[mesh.t_pos_idx].double().mean(1), self._depth)
+        share = torch.rand(int(self._cell.max()) + 1, generator=generator)
+        self._aside = (share < CHECKED_SHARE).to(self._cell.device)[self._cell]
+
+    def moved(self, offsets: Tensor) -> Mesh:
+        """The mesh with its vertices moved by offsets [V] metres along their normals."""
+        return Mesh(self.mesh.v_pos + offsets[:, None] * self._normal, self.mesh.t_pos_idx)
+
+    def look(self, mesh: Mesh) -> _Seen | None:
+        """Points of the mesh and who sees them; None where hardly anything is seen by two views."""
+        cameras, depths = self._cameras, self._depths
+        if mesh is not self.mesh:
+            _, depths = surface_depths(mesh, self._scene.views, self._size, self._scene.kind)
+        detail = self._features[:, 1:].norm(dim=1)
+        surface = draw_candidates(mesh, cameras, depths, detail, self._generator)
+        if len(surface.position) < MIN_POINTS:
+            return None
+        surface = surface.chosen(order_of_preference(surface, self._generator))
+        everything = torch.arange(len(surface.position), device=depths.device)
+        points = observe(surface, everything, cameras, depths, POINTS_PER_VIEW)
+        measured = torch.zeros(points.point.shape, device=depths.device)
+        where = sample_points(self._features, self._K, self._poses, points, self._size).pixel
+        grid = (2 * where / where.new_tensor(self._size) - 1)[:, None]
+        for row, view in enumerate(self._scene.views):
+            if view.depth is not None:
+                depth = view.depth[None, None].to(where)
+                measured[row] = F.grid_sample(depth, grid[row : row + 1], mode="nearest", align_corners=False)[0, 0, 0]
+        return _Seen(surface, points, measured)
+
+    def step(self, offsets: Tensor, features: Tensor, seen: _Seen, scale: int) -> Tensor:
+        """The offsets [V] after a Gauss-Newton step. features: `local_contrast` at this shrink factor."""
+        mesh, corners = self.moved(offsets), self.mesh.t_pos_idx[seen.surface.face]
+        weights = seen.surface.weights.float()
+        points = replace(seen.points, position=seen.surface.on(mesh))
+        normal = F.normalize((self._normal[corners] * weights[..., None]).sum(1), dim=1)
+        evidence, pull = self._evidence(features, seen, points, normal)
+
+        def to_vertices(value: Tensor) -> Tensor:
+            spread = (value[:, None] * weights).flatten()
+            return torch.zeros_like(offsets).index_add_(0, corners.flatten(), spread)
+
+        a, b = self._edges.unbind(1)
+        mean = to_vertices(evidence)
+        mean = mean.sum() / (mean > 0).sum().clamp(min=1) + 1e-12
+
+        def smoothness(d: Tensor) -> Tensor:
+            slope = d[a] - d[b]
+            smooth = torch.zeros_like(d).index_add_(0, a, slope).index_add_(0, b, -slope)
+            return mean * (SMOOTH * smooth + SMALL * d)
+
+        def product(d: Tensor) -> Tensor:
+            return to_vertices(evidence * (d[corners] * weights).sum(1)) + smoothness(d)
+
+        squares = (evidence[:, None] * weights.square()).flatten()
+        degree = torch.bincount(self._edges.flatten(), minlength=len(offsets)).to(offsets)
+        diagonal = torch.zeros_like(offsets).index_add_(0, corners.flatten(), squares)
+        diagonal = diagonal + mean * (SMOOTH * degree + SMALL)
+        rest = to_vertices(pull) - smoothness(offsets)
+        change = _conjugate_gradients(product, rest, diagonal)
+        longest = LARGEST_STEP * scale * self._depth / float(self._K[0, 0, 0])
+        most = MOST * self._depth
+        return (offsets + change.clamp(-longest, longest)).clamp(-most, most)
+
+    def _evidence(self, features: Tensor, seen: _Seen, points: Observations, normal: Tensor) -> tuple[Tensor, Tensor]:
+        """a and b [P] of each point: how sure it is where it should lie along its normal [P,3], times how far off."""
+        samples = sample_points(features, self._K, self._poses, points, self._size)
+        residual, weight = residuals(samples.value, samples.valid, points, ROBUST_SCALE)
+        local = normal[points.point] @ self._poses[:, :3, :3].mT.float()
+        z = samples.local[..., 2].clamp(min=1e-6)
+        across = samples.gradient * self._K.diagonal(dim1=1, dim2=2)[:, None, :2].float() / z[..., None]
+        along = -(across * samples.local[..., :2]).sum(-1) / z
+        jacobian = (across * local[..., :2]).sum(-1) + along * local[..., 2]
+        relative = jacobian - weighted_mean(jacobian, weight, points)[0][points.point]
+        photo = weight * ~self._aside[seen.surface.face][points.point] / ROBUST_SCALE**2
+        # How far a reading lies from the point's plane.
+        off = (seen.measured - samples.local[..., 2]) * (local * samples.local).sum(-1) / z
+        read = samples.valid & (seen.measured > 0)
+        deviation = 1.4826 * off[read].abs().median().nan_to_num(0.0).clamp(min=LEAST_DEVIATION)
+        depth = DEPTH_WEIGHT * read / (1 + (off / (2 * deviation)).square()) / deviation.square()
+        zero, point = off.new_zeros(len(points.position)), points.point.flatten()
+        sure = (photo * relative.square() + depth).flatten()
+        pull = (depth * off - photo * relative * residual).flatten()
+        return zero.index_add(0, point, sure), zero.index_add(0, point, pull)
+
+    def judged(self, found: Mesh, seen: _Seen) -> tuple[bool, dict[str, Any]]:
+        """Whether the photographs agree better on the found mesh where they had no say, and the report about it."""
+        points, valid, values = seen.points, seen.points.seen & self._aside[seen.surface.face][seen.points.point], []
+        for mesh in (self.mesh, found):
+            placed = replace(points, position=seen.surface.on(mesh), seen=valid)
+            samples = sample_points(self._features, self._K, self._poses, placed, self._size)
+            values.append(samples.value[..., None])
+            valid = samples.valid
+        before, after = (float(disagreement(value, valid, points, CONTRAST_SCALE).nanmean()) for value in values)
+        taken = better(values[0], values[1], valid, points, self._cell[seen.surface.face], CONTRAST_SCALE)
+        return taken, {"residual_before": round(before, 4), "residual_after": round(after, 4)}
+
+
+def _conjugate_gradients(product: Callable[[Tensor], Tensor], right: Tensor, diagonal: Tensor) -> Tensor:
+    """x [V] with product(x) = right, about; preconditioned with the matrix's diagonal."""
+    x, rest = torch.zeros_like(right), right
+    direction = condition = rest / diagonal
+    energy = (rest * condition).sum()
+    for _ in range(SOLVER_STEPS):
+        image = product(direction)
+        length = energy / (direction * image).sum().clamp(min=1e-30)
+        x, rest = x + length * direction, rest - length * image
+        condition = rest / diagonal
+        before, energy = energy, (rest * condition).sum()
+        direction = condition + energy / before.clamp(min=1e-30) * direction
+    return x

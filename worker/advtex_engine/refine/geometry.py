@@ -48,6 +48,7 @@ DEPTH_WEIGHT = 0.2
 LEAST_DEVIATION = 0.001  # metres, of the depth's readings
 LARGEST_STEP = 3.0  # pixels of the level
 MOST = 0.04  # of the median depth
+ONE_SIDED = 0.9  # share of the looks at the outside from which on a mesh is taken to have one
 SOLVER_STEPS = 60
 
 
@@ -129,8 +130,14 @@ class _Surface:
         surface = surface.chosen(order_of_preference(surface, self._generator))
         everything = torch.arange(len(surface.position), device=depths.device)
         points = observe(surface, everything, cameras, depths, POINTS_PER_VIEW)
+        samples = sample_points(self._features, self._K, self._poses, points, self._size)
+        normal = surface.normal[points.point].float() @ self._poses[:, :3, :3].mT.float()
+        facing = (normal * samples.local).sum(-1) < 0
+        # Of a mesh with an outside, what a view sees from behind is the far side of something thin, through errors.
+        if facing[points.seen].float().mean() > ONE_SIDED:
+            points = replace(points, seen=points.seen & facing)
         measured = torch.zeros(points.point.shape, device=depths.device)
-        where = sample_points(self._features, self._K, self._poses, points, self._size).pixel
+        where = samples.pixel
         grid = (2 * where / where.new_tensor(self._size) - 1)[:, None]
         for row, view in enumerate(self._scene.views):
             if view.depth is not None:

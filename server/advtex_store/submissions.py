@@ -117,7 +117,8 @@ class Submissions:
                 batch=spec.batch,
                 state=JobState.checking.value,
                 label=spec.label,
-                options=spec.options.model_dump(mode="json"),
+                # What was left open is left out: workers of the release before refuse names that they do not know.
+                options=spec.options.model_dump(mode="json", exclude_none=True),
                 priority=spec.priority,
                 attempt=0,
                 progress=Progress().model_dump(mode="json"),

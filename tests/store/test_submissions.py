@@ -8,6 +8,8 @@ from typing import Any
 import pytest
 
 from advtex_contract.jobs import JobSpec, JobState
+from advtex_contract.options import JobOptions
+from advtex_contract.stored_options import read_options
 from advtex_store.errors import IdempotencyInFlight, IdempotencyMismatch, RecordNotFound
 from advtex_store.submissions import HOLD_SECONDS, JobFilter, Reservation
 
@@ -25,6 +27,15 @@ def test_a_job_renews_its_upload(bench: Any) -> None:
     bench.clock.now += 900
     bench.submissions.create_job(bench.owner, JobSpec(upload_id=upload))
     assert bench.uploads.upload(upload).expires_at == bench.clock.now + 1000
+
+
+def test_a_row_holds_the_options_that_were_given(bench: Any) -> None:
+    """Of the others an older worker may not know the names."""
+    given = JobOptions(steps=30, seed=0)
+    row = bench.submissions.create_job(bench.owner, JobSpec(upload_id=bench.finished_upload(), options=given))
+    assert {name: row.options[name] for name in ("steps", "seed")} == {"steps": 30, "seed": 0}
+    assert None not in row.options.values()
+    assert read_options(row.options) == given
 
 
 def test_pages_show_every_job_once_newest_first(bench: Any) -> None:

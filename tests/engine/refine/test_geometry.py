@@ -123,6 +123,27 @@ def test_a_mesh_that_one_view_sees_stays(bumpy: Scene) -> None:
     assert found.report["refined"] is False
 
 
+def test_where_views_share_too_little_to_judge_the_mesh_stays(bumpy: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(geometry, "CHECKED_SHARE", 0.0)
+    found = refine_geometry(bumpy, CPU, 0)
+    assert found.v_pos is None
+    assert found.report == {"refined": False, "residual_before": None, "residual_after": None}
+
+
+def test_the_far_side_of_a_wall_is_not_seen_where_errors_push_it_through(true_scene: Scene) -> None:
+    near = true_scene.mesh
+    deep = torch.where(near.v_pos[:, :2].norm(dim=1) < 0.2, -0.005, 0.04)  # metres; in the middle it lies before
+    far = near.v_pos - deep[:, None] * torch.tensor([0.0, 0.0, 1.0])
+    faces = torch.cat((near.t_pos_idx, near.t_pos_idx.flip(1) + len(far)))
+    wall = replace(true_scene, mesh=Mesh(torch.cat((near.v_pos, far)), faces))
+    color = geometry.working_color(wall.views, CPU)
+    seen = geometry._Surface(wall.mesh, wall, color, torch.Generator().manual_seed(0)).look(wall.mesh)
+    assert seen is not None
+    drawn, looked_at = seen.surface.face, seen.points.point[seen.points.seen]
+    assert int((drawn >= len(near.t_pos_idx)).sum()) > 500
+    assert bool((drawn[looked_at] < len(near.t_pos_idx)).all())
+
+
 def test_a_step_is_that_of_dense_normal_equations(bumpy: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """The offsets of a step against all of its terms written out, as one dense system."""
     monkeypatch.setattr(geometry, "SOLVER_STEPS", 400)

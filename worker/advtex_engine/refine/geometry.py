@@ -14,6 +14,7 @@ as it came unless they agree better there afterwards.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -41,6 +42,7 @@ from advtex_engine.refine.working_views import CHECKED_SHARE, CONTRAST_SCALE, lu
 
 LEVELS = ((4, 3), (2, 3), (1, 3))  # shrink factor of the image, Gauss-Newton steps
 POINTS_PER_VIEW = 20_000
+LOOKS = 2_000_000  # of all views together: bounds the memory, some 200 bytes each
 MIN_POINTS = 1000  # that two views must see, to move anything
 SMOOTH, SMALL = 0.3, 0.01  # pulls to the neighbors' offsets and to 0, relative to the mean evidence for a vertex
 # Readings of one place err together, so that many are hardly more evidence than a few.
@@ -72,7 +74,9 @@ class _Seen:
 def refine_geometry(scene: Scene, device: torch.device, seed: int) -> GeometryRefinement:
     """Vertices along their normals, from the training views' photographs and depth; held-out views are not read.
 
-    On a CPU the same input and seed give the same result. Not differentiable.
+    The report's residuals are mean disagreements of the views, in local contrasts, at points where the photographs had
+    no say; None where too few views share such points. On a CPU the same input and seed give the same result. Not
+    differentiable.
     """
     generator = torch.Generator().manual_seed(seed)
     color = working_color(scene.views, device)
@@ -88,7 +92,8 @@ def refine_geometry(scene: Scene, device: torch.device, seed: int) -> GeometryRe
         for _ in range(steps):
             offsets = given.step(offsets, features, seen, scale)
         taken, report = given.judged(given.moved(offsets), first)
-        if report["residual_after"] > MARGIN * report["residual_before"]:  # what begins like that comes to nothing
+        before, after = report["residual_before"], report["residual_after"]
+        if before is None or after > MARGIN * before:  # what begins like that comes to nothing
             break
     report = {"refined": taken, **report}
     if not taken:
@@ -129,7 +134,8 @@ class _Surface:
             return None
         surface = surface.chosen(order_of_preference(surface, self._generator))
         everything = torch.arange(len(surface.position), device=depths.device)
-        points = observe(surface, everything, cameras, depths, POINTS_PER_VIEW)
+        most = min(POINTS_PER_VIEW, max(1, LOOKS // len(cameras)))
+        points = observe(surface, everything, cameras, depths, most)
         samples = sample_points(self._features, self._K, self._poses, points, self._size)
         normal = surface.normal[points.point].float() @ self._poses[:, :3, :3].mT.float()
         facing = (normal * samples.local).sum(-1) < 0
@@ -208,9 +214,10 @@ class _Surface:
             samples = sample_points(self._features, self._K, self._poses, placed, self._size)
             values.append(samples.value[..., None])
             valid = samples.valid
-        before, after = (float(disagreement(value, valid, points, CONTRAST_SCALE).nanmean()) for value in values)
         taken = better(values[0], values[1], valid, points, self._cell[seen.surface.face], CONTRAST_SCALE)
-        return taken, {"residual_before": round(before, 4), "residual_after": round(after, 4)}
+        residual = [float(disagreement(value, valid, points, CONTRAST_SCALE).nanmean()) for value in values]
+        before, after = (None if math.isnan(mean) else round(mean, 4) for mean in residual)
+        return taken, {"residual_before": before, "residual_after": after}
 
 
 def _conjugate_gradients(product: Callable[[Tensor], Tensor], right: Tensor, diagonal: Tensor) -> Tensor:

@@ -35,7 +35,7 @@ from advtex_engine.refine.working_views import CONTRAST_SCALE, WorkingViews, mot
 from advtex_engine.runtime.threads import in_threads, one_thread_each
 
 COLOR_SCALE = 0.1  # disagreements beyond twice that are highlights
-ROUNDS = 2
+ROUNDS = 2  # of geometry
 DEVICE_POINTS = 1250  # per view
 DEVICE_MARGIN = 0.9  # of the disagreement may be left for a correction of the device to be taken
 
@@ -69,16 +69,20 @@ def refinement_from_dict(saved: Mapping[str, Any]) -> Refinement:
 
 
 def refine_scene(scene: Scene, device: torch.device, seed: int) -> Refinement:
-    """Cameras and exposures, and then the geometry; where that has moved, both once more: each was found beside what
-    was wrong with the other."""
+    """Cameras and exposures, and then the geometry; where that has moved, poses and geometry once more: each was found
+    beside what was wrong with the other.
+
+    The report tells of the first cameras, and of the geometry round by round.
+    """
     refinement = refine_cameras(scene, device, seed)
     rounds = list[dict[str, Any]]()
     while len(rounds) < ROUNDS:
         refined = apply_refinement(scene, refinement)
         if rounds:
             again = refine_cameras(refined, device, seed)
-            refinement = replace(refinement, world_to_camera=again.world_to_camera)
-            refined = apply_refinement(scene, refinement)
+            if again.lens is None:  # a device that would only now be found grossly wrong is not
+                refinement = replace(refinement, world_to_camera=again.world_to_camera)
+                refined = apply_refinement(scene, refinement)
         geometry = refine_geometry(refined, device, seed)
         rounds.append(geometry.report)
         if geometry.v_pos is None:

@@ -27,7 +27,9 @@ def service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[LiveSer
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     for name in ("HOME", "XDG_STATE_HOME", "XDG_CONFIG_HOME"):
         monkeypatch.setenv(name, str(tmp_path / name))
-    with live_service(tmp_path, settings={"ADVTEX_DEVICE": "auto", "ADVTEX_JOBS_PER_GPU": "2"}) as running:
+    slots = {"ADVTEX_DEVICE": "auto", "ADVTEX_JOBS_PER_GPU": "2"}
+    # nobody dies here: the lease outlasts nine processes that begin at once on a busy machine
+    with live_service(tmp_path, settings={**slots, "ADVTEX_LEASE_SECONDS": "20"}) as running:
         yield running
 
 

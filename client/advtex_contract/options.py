@@ -10,11 +10,13 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    SerializerFunctionWrapHandler,
     ValidationError,
     ValidationInfo,
     ValidatorFunctionWrapHandler,
     create_model,
     field_validator,
+    model_serializer,
     model_validator,
 )
 from pydantic_core import PydanticCustomError
@@ -25,7 +27,17 @@ from advtex_options.words import PRESET_COST, PRESET_HELP, Preset
 __all__ = ["PRESET_COST", "PRESET_HELP", "JobOptions", "Preset", "chosen_options"]
 
 
-class _Checked(BaseModel, frozen=True):
+class GivenOnly(BaseModel, frozen=True):
+    """Written without what is not given: a reader of another release refuses a name that it does not know."""
+
+    @model_serializer(mode="wrap")
+    def _given(self, write: SerializerFunctionWrapHandler):  # type: ignore[no-untyped-def]
+        # no return annotation: it would take the place of the fields in the API's description
+        usual = {name: field.default for name, field in type(self).model_fields.items()}
+        return {name: value for name, value in write(self).items() if value is not None or usual[name] is not None}
+
+
+class _Checked(GivenOnly, frozen=True):
     """What is checked of the options, and told in the same words as everywhere else."""
 
     model_config = ConfigDict(extra="forbid")

@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, Field, TypeAdapter, create_model
+from pydantic import BeforeValidator, Field, TypeAdapter, create_model
 
-from advtex_contract.options import JobOptions, known_options
+from advtex_contract.options import GivenOnly, JobOptions, known_options
 from advtex_options import Options
 
 if TYPE_CHECKING:
 
-    class OtherOptions(BaseModel, Options, frozen=True):
+    class OtherOptions(GivenOnly, Options, frozen=True):
         preset: Any = None
         method: Any = None
         width: Any = None
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 else:
     OtherOptions = create_model(
         "OtherOptions",
+        __base__=GivenOnly,
         __module__=__name__,
-        __config__={"frozen": True},
         __doc__="Options with values that are not known here, as another version has written them.",
         **{name: (Any, field.default) for name, field in JobOptions.model_fields.items()},
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from urllib.parse import quote
@@ -82,7 +81,7 @@ class Service:
             raise ApiError(ErrorCode.bad_request, f"retention_seconds: jobs are kept for {most} s at most", status=422)
         reservation: Reservation | None = None
         if token is not None:
-            held = self.store.submissions.reserve(owner, token, hashlib.sha256(_canonical(spec)).hexdigest())
+            held = self.store.submissions.reserve(owner, token, spec)
             if isinstance(held, JobRow):
                 if held.deleted_at is not None:
                     raise ApiError(ErrorCode.conflict, "the job of this idempotency key was deleted; use a new key")
@@ -229,10 +228,6 @@ def _check_method(name: str) -> None:
         where, remedy = "body.options.method", "choose one of these, or ask the operator to install the package"
         detail = ErrorDetail(code="unknown_method", where=where, message=words, remedy=remedy)
         raise ApiError(ErrorCode.invalid_options, f"{where}: {words}", [detail])
-
-
-def _canonical(spec: JobSpec) -> bytes:
-    return spec.model_dump_json().encode()
 
 
 def _time(seconds: float) -> datetime:

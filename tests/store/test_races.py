@@ -10,13 +10,14 @@ from typing import Any
 import pytest
 from sqlalchemy import event
 
-from advtex_contract.jobs import TERMINAL, JobState
+from advtex_contract.jobs import TERMINAL, JobSpec, JobState
 from advtex_store.errors import IdempotencyInFlight, QuotaExceeded
 from advtex_store.models import DeliveryRow
 from advtex_store.submissions import Reservation
 from advtex_store.webhooks import MOST_FAILURES, MOST_PER_OWNER, Webhooks
 
 URL = "https://receiver.example/hook"
+SPEC = JobSpec(upload_id="scan")
 
 
 @pytest.fixture(autouse=True)
@@ -46,12 +47,12 @@ def meanwhile(bench: Any) -> Callable[[str, Callable[[], object]], Callable[[], 
 
 
 def test_a_key_that_is_released_while_it_is_asked_for(bench: Any, meanwhile: Any) -> None:
-    held = bench.submissions.reserve(bench.owner, "key", "body")
+    held = bench.submissions.reserve(bench.owner, "key", SPEC)
     ended = meanwhile("insert into idempotency", lambda: bench.submissions.release(held))
     with pytest.raises(IdempotencyInFlight):
-        bench.submissions.reserve(bench.owner, "key", "body")
+        bench.submissions.reserve(bench.owner, "key", SPEC)
     ended()
-    assert isinstance(bench.submissions.reserve(bench.owner, "key", "body"), Reservation)
+    assert isinstance(bench.submissions.reserve(bench.owner, "key", SPEC), Reservation)
 
 
 def test_a_webhook_that_is_deleted_while_a_job_ends(bench: Any, meanwhile: Any) -> None:

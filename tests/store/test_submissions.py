@@ -11,7 +11,10 @@ from advtex_contract.jobs import JobSpec, JobState
 from advtex_contract.options import JobOptions
 from advtex_contract.stored_options import read_options
 from advtex_store.errors import IdempotencyInFlight, IdempotencyMismatch, RecordNotFound
+from advtex_store.models import IdempotencyRow, JobRow
 from advtex_store.submissions import HOLD_SECONDS, JobFilter, Reservation
+
+SPEC, OTHER = JobSpec(upload_id="scan"), JobSpec(upload_id="scan", options=JobOptions(seed=7))
 
 
 def test_a_job_needs_a_finished_upload_of_its_owner(bench: Any) -> None:
@@ -72,30 +75,46 @@ def test_pages_show_every_job_once_newest_first(bench: Any) -> None:
 
 def test_an_idempotency_key_makes_one_job(bench: Any) -> None:
     spec = JobSpec(upload_id=bench.finished_upload())
-    held = bench.submissions.reserve(bench.owner, "key", "body")
+    held = bench.submissions.reserve(bench.owner, "key", SPEC)
     with pytest.raises(IdempotencyInFlight):
-        bench.submissions.reserve(bench.owner, "key", "body")
+        bench.submissions.reserve(bench.owner, "key", SPEC)
     with pytest.raises(IdempotencyMismatch):
-        bench.submissions.reserve(bench.owner, "key", "other body")
-    assert isinstance(bench.submissions.reserve("somebody else", "key", "other body"), Reservation)
+        bench.submissions.reserve(bench.owner, "key", OTHER)
+    assert isinstance(bench.submissions.reserve("somebody else", "key", OTHER), Reservation)
     job = bench.submissions.create_job(bench.owner, spec, reservation=held)
-    assert bench.submissions.reserve(bench.owner, "key", "body").id == job.id
+    assert bench.submissions.reserve(bench.owner, "key", SPEC).id == job.id
     with pytest.raises(IdempotencyMismatch):
-        bench.submissions.reserve(bench.owner, "key", "other body")
+        bench.submissions.reserve(bench.owner, "key", OTHER)
     bench.submissions.release(held)  # too late: the key stays bound
-    assert bench.submissions.reserve(bench.owner, "key", "body").id == job.id
+    assert bench.submissions.reserve(bench.owner, "key", SPEC).id == job.id
+
+
+@pytest.mark.parametrize(
+    "other", [{"label": "b"}, {"upload_id": "b"}, {"options": JobOptions(seed=7)}, {"priority": 1}]
+)
+def test_a_key_of_the_release_before_is_known_by_its_job(bench: Any, other: dict[str, Any]) -> None:
+    """It wrote the same body in other words, and the options that were not given as null."""
+    spec = JobSpec(upload_id=bench.finished_upload(), label="a", options=JobOptions(steps=30))
+    held = bench.submissions.reserve(bench.owner, "key", spec)
+    job = bench.submissions.create_job(bench.owner, spec, reservation=held)
+    with bench.database.write() as session:
+        session.get_one(IdempotencyRow, (bench.owner, "key")).body_sha256 = "of other words"
+        session.get_one(JobRow, job.id).options = {**job.options, "width": None, "holdout": None}
+    assert bench.submissions.reserve(bench.owner, "key", spec).id == job.id
+    with pytest.raises(IdempotencyMismatch):
+        bench.submissions.reserve(bench.owner, "key", spec.model_copy(update=other))
 
 
 def test_a_released_key_is_free(bench: Any) -> None:
-    bench.submissions.release(bench.submissions.reserve(bench.owner, "key", "body"))
-    assert isinstance(bench.submissions.reserve(bench.owner, "key", "other body"), Reservation)
+    bench.submissions.release(bench.submissions.reserve(bench.owner, "key", SPEC))
+    assert isinstance(bench.submissions.reserve(bench.owner, "key", OTHER), Reservation)
 
 
 def test_a_dead_request_gives_its_key_away_and_makes_no_second_job(bench: Any) -> None:
     spec = JobSpec(upload_id=bench.finished_upload())
-    slow = bench.submissions.reserve(bench.owner, "key", "body")
+    slow = bench.submissions.reserve(bench.owner, "key", SPEC)
     bench.clock.now += HOLD_SECONDS + 1
-    fast = bench.submissions.reserve(bench.owner, "key", "body")
+    fast = bench.submissions.reserve(bench.owner, "key", SPEC)
     assert isinstance(fast, Reservation)
     with pytest.raises(IdempotencyInFlight):
         bench.submissions.create_job(bench.owner, spec, reservation=slow)
@@ -111,7 +130,7 @@ def test_many_requests_at_once_make_one_job(bench: Any) -> None:
     def submit() -> None:
         barrier.wait()
         try:
-            held = bench.submissions.reserve(bench.owner, "key", "body")
+            held = bench.submissions.reserve(bench.owner, "key", SPEC)
         except IdempotencyInFlight:
             answers.append("in flight")
             return

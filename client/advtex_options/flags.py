@@ -52,9 +52,8 @@ def flag(name: str, **more: Any) -> Any:
     if about.bounds:
         words.append(about.bounds)
     metavar = "WxH" if name == "size" else "NAME" if about.choices is not None else "N"
-    return typer.Option(
-        f"--{name.replace('_', '-')}", metavar=metavar, help=". ".join(words), show_default=about.unset, **more
-    )
+    more |= {} if kind_of(name) is bool else {"metavar": metavar}
+    return typer.Option(f"--{name.replace('_', '-')}", help=". ".join(words), show_default=about.unset, **more)
 
 
 def version_flag(program: str) -> Any:

@@ -121,6 +121,12 @@ class Options:
         unset="the one that fits best",
         choices=MappingProxyType(dict.fromkeys(LAYOUT_NAMES, "")),
     )
+    lossless: bool | None = option(
+        None,
+        "images inside of models as PNG: exact, and four times as large",
+        "Lossless images",
+        unset="no, they are JPEG in all but the OBJ",
+    )
 
 
 SIZE = Described(
@@ -144,9 +150,9 @@ def described() -> Mapping[str, Described]:
 
 @cache
 def kind_of(name: str) -> type[int | float | str]:
-    """What a single value of the option is: int, float or str."""
+    """What a single value of the option is: bool, int, float or str."""
     hint = get_type_hints(Options).get(name, str if name == "size" else int)
-    return next(kind for kind in (int, float, str) if hint in (kind, kind | None))
+    return next(kind for kind in (bool, int, float, str) if hint in (kind, kind | None))
 
 
 def refusal(name: str, value: object) -> str | None:
@@ -161,9 +167,11 @@ def refusal(name: str, value: object) -> str | None:
     if about.choices is not None:
         known = isinstance(value, str) and value in about.choices
         return None if known else f"{name} {shown} is unknown; choose one of {', '.join(about.choices)}{unset}"
+    kind = int if name in sides else kind_of(name)
+    if kind is bool and not isinstance(value, bool):
+        return f"{name} {shown} is neither true nor false; give one of them{unset}"
     if about.low is None or about.high is None:
         return None
-    kind = int if name in sides else kind_of(name)
     for number in value if isinstance(value, tuple) else (value,):
         if isinstance(number, bool) or not isinstance(number, kind if kind is int else int | float):
             return f"{name} {shown} is no {'whole ' if kind is int else ''}number; give {about.bounds}{unset}"

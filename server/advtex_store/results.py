@@ -14,7 +14,13 @@ from advtex_store.blobs import Blobs
 from advtex_store.errors import BlobNotFound, IllegalTransition
 from advtex_store.records import Records
 
-CONTENT_TYPES = {".glb": "model/gltf-binary", ".obj": "model/obj", ".mtl": "model/mtl", ".log": "text/plain"}
+CONTENT_TYPES = {
+    ".glb": "model/gltf-binary",
+    ".obj": "model/obj",
+    ".mtl": "model/mtl",
+    ".usdz": "model/vnd.usdz+zip",
+    ".log": "text/plain",
+}
 
 
 class StoredFile(BaseModel):

@@ -48,6 +48,16 @@ def test_bounds_of_options(name: str, low: int, high: int) -> None:
             JobOptions.model_validate(both | {name: value})
 
 
+@pytest.mark.parametrize(("given", "meant"), [(True, True), ("true", True), ("false", False), (None, None)])
+def test_yes_or_no_may_be_written_as_a_column_has_it(given: object, meant: bool | None) -> None:
+    assert chosen_options({"lossless": given}).lossless is meant
+
+
+def test_neither_yes_nor_no_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"lossless 'maybe' is neither true nor false; give one of them, or leave it"):
+        chosen_options({"lossless": "maybe"})
+
+
 @pytest.mark.parametrize("side", ["width", "height"])
 def test_half_a_size_is_refused(side: str) -> None:
     with pytest.raises(ValidationError, match="width and height go together"):

@@ -89,7 +89,15 @@ def test_a_run_leaves_models_previews_and_a_report(whole: tuple[Path, Recorder])
     out, recorder = whole
     assert tuple(recorder.stages) == WITH_MESH
     assert recorder.steps == list(range(1, STEPS + 1))
-    for name in ("model.obj", "model.mtl", "model.png", "model.glb", "previews/comparison.png", "previews/sheet.png"):
+    for name in (
+        "model.obj",
+        "model.mtl",
+        "model.png",
+        "model.glb",
+        "model.usdz",
+        "previews/comparison.png",
+        "previews/sheet.png",
+    ):
         assert (out / name).stat().st_size > 50, name
     manifest = json.loads((out / "previews/manifest.json").read_text())
     assert [view["heldout"] for view in manifest["views"]].count(True) == 2

@@ -54,7 +54,7 @@ class RunResult:
 def texture_scan(
     scan: Path, out: Path, config: TextureConfig, *, work: Path, resume: bool = False, monitor: Monitor | None = None
 ) -> RunResult:
-    """Textures a scan: model.obj, model.mtl, model.png, model.glb, report.json, previews/ and index.html below `out`.
+    """Textures a scan: the model (`export_model`), report.json, previews/ and index.html below `out`.
 
     work: folder for stage caches and checkpoints. With `resume`, what it holds of the same scan and options is used;
     without, it is cleared. Where memory runs out, the run begins again from its caches with less to hold
@@ -95,7 +95,7 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
     with stages.run("dilation"):
         texture = fill_holes(texture, touched)
     with stages.run("export"):
-        files = export_model(out, atlas, texture, up_axis=scene.up_axis)
+        files = export_model(out, atlas, texture, up_axis=scene.up_axis, lossless=config.lossless, usdz=True)
     with stages.run("previews"):
         files += write_gallery(out, scene, atlas, texture, mean, curves(losses, given.live.quality))
         atlas = replace(atlas, mesh=atlas.mesh.to(torch.device("cpu")))

@@ -143,6 +143,7 @@ function spec(uploadId) {
   for (const { name, value, dataset } of form.querySelectorAll("[data-option]")) {
     if (value === "") continue;
     if (name === "size") [options.width, options.height] = parseSize(value);
+    else if (dataset.option === "bool") options[name] = value === "true";
     else options[name] = dataset.option === "str" ? value : Number(value);
   }
   return { upload_id: uploadId, options, label: given.label, ...(given.batch && { batch: given.batch }) };

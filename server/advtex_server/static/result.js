@@ -6,7 +6,7 @@ import { showComparison } from "./compare.js";
 import { showCurves } from "./chart.js";
 
 const FILES = {
-  "model.glb": "One file; for viewers, game engines, the web", "model.obj": "Geometry; needs the .mtl and the textures",
+  "model.glb": "One file; for viewers, game engines, the web", "model.usdz": "One file; for AR on iPhone and iPad", "model.obj": "Geometry; needs the .mtl and the textures",
   "model.mtl": "Materials of the OBJ", "model.png": "Texture", "report.json": "Everything that was measured",
   "index.html": "The pictures, to be opened from disk",
 };

@@ -15,7 +15,8 @@ from torch import Tensor
 from advtex_engine.core.scene import Atlas, Camera, Mesh
 from advtex_engine.mesh.models import ModelError, load_model, load_reference
 from advtex_engine.render.render_view import render_layers
-from advtex_engine.results.export import encode_png, export_model
+from advtex_engine.results.export import export_model
+from advtex_engine.results.images import encode_png
 
 CORNERS = ((0, 0.0), (1, 0.0), (1, 1.0), (0, 1.0))
 TEXTURE = torch.randint(0, 256, (12, 16, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
@@ -32,7 +33,7 @@ def board() -> Atlas:
 @pytest.fixture
 def files(tmp_path: Path) -> Path:
     """A folder with model.obj, .mtl, .png and .glb; +y is up, so that the GLB's node turns nothing."""
-    export_model(tmp_path, board(), TEXTURE, up_axis="+y")
+    export_model(tmp_path, board(), TEXTURE, up_axis="+y", lossless=True)
     return tmp_path
 
 
@@ -91,7 +92,7 @@ def sheet(pages: int) -> tuple[Atlas, Tensor]:
 @pytest.mark.parametrize("pages", [1, 2, 3])
 def test_pages_are_read_back_as_one_texture(tmp_path: Path, name: str, pages: int) -> None:
     atlas, texture = sheet(pages)
-    files = export_model(tmp_path, atlas, texture, up_axis="+y")
+    files = export_model(tmp_path, atlas, texture, up_axis="+y", lossless=True)
     count = max(1, pages**2 - 1)
     pngs = ["model.png", *(f"model_{number}.png" for number in range(2, count + 1))]
     assert sorted(file.name for file in files) == sorted(["model.obj", "model.mtl", "model.glb", *pngs])
@@ -113,7 +114,7 @@ def sorted_faces(atlas: Atlas) -> Tensor:
 @pytest.mark.parametrize("name", ["model.obj", "model.glb"])
 def test_pages_look_like_the_atlas_that_they_came_from(tmp_path: Path, name: str) -> None:
     atlas, texture = sheet(2)
-    export_model(tmp_path, atlas, texture, up_axis="+y")
+    export_model(tmp_path, atlas, texture, up_axis="+y", lossless=True)
     K = torch.tensor([[60.0, 0, 48], [0, 60, 16], [0, 0, 1]], dtype=torch.float64)
     world_to_camera = torch.eye(4, dtype=torch.float64)
     world_to_camera[:3, 3] = torch.tensor([-2.5, -0.5, 4])
@@ -129,11 +130,11 @@ def test_a_face_across_two_pages_is_not_exported(tmp_path: Path) -> None:
     across = torch.tensor([[0, 4, 8]] * len(atlas.mesh.t_pos_idx))
     torn = replace(atlas, mesh=replace(atlas.mesh, t_uv_idx=across))
     with pytest.raises(AssertionError, match="crosses the border"):
-        export_model(tmp_path, torn, texture, up_axis="+y")
+        export_model(tmp_path, torn, texture, up_axis="+y", lossless=True)
 
 
 def test_pages_of_different_sizes_are_refused(tmp_path: Path) -> None:
-    export_model(tmp_path, *sheet(2), up_axis="+y")
+    export_model(tmp_path, *sheet(2), up_axis="+y", lossless=True)
     (tmp_path / "model_2.png").write_bytes(encode_png(TEXTURE))
     with pytest.raises(ModelError, match="3 textures differ in size"):
         load_model(tmp_path / "model.obj")

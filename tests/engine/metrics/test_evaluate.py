@@ -115,7 +115,7 @@ def write_scan(folder: Path, depth: Callable[[np.ndarray], None] | None = None, 
 
 
 def write_model(folder: Path, atlas: Atlas, texture: Tensor, up_axis: str = "+z") -> Path:
-    export_model(folder, atlas, texture, up_axis=up_axis)
+    export_model(folder, atlas, texture, up_axis=up_axis, lossless=True)
     return folder / "model.obj"
 
 

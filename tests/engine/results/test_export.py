@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import struct
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,8 @@ from embreex.mesh_construction import TriangleMesh
 from advtex_engine.core.scene import TO_Y_UP, Atlas, Camera, Mesh
 from advtex_engine.mesh.normals import vertex_normals
 from advtex_engine.render.render_view import render_layers
-from advtex_engine.results.export import encode_png, export_model
+from advtex_engine.results.export import export_model
+from advtex_engine.results.images import encode_png
 from advtex_engine.runtime.files import atomic_file, write_atomically
 
 VALIDATOR = Path(__file__).parents[1] / "gltf_validator"
@@ -143,9 +146,13 @@ def accessor(document: dict[str, Any], binary: bytes, index: int) -> np.ndarray:
 
 
 def embedded_png(path: Path) -> bytes:
+    return embedded_image(path, "image/png")
+
+
+def embedded_image(path: Path, media_type: str) -> bytes:
     document, binary = glb_chunks(path)
     image = document["images"][document["textures"][0]["source"]]
-    assert image["mimeType"] == "image/png"
+    assert image["mimeType"] == media_type
     view = document["bufferViews"][image["bufferView"]]
     return binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
 
@@ -153,7 +160,7 @@ def embedded_png(path: Path) -> bytes:
 @pytest.mark.parametrize("suffix", ["obj", "glb"])
 def test_other_loaders_show_the_same_image(tmp_path: Path, suffix: str) -> None:
     atlas, texture = globe()
-    export_model(tmp_path, atlas, texture, up_axis="+z")
+    export_model(tmp_path, atlas, texture, up_axis="+z", lossless=True)
     camera = camera_on_globe()
     color, coverage = render_layers(atlas, texture, camera, supersample=1)
     if suffix == "obj":
@@ -175,7 +182,7 @@ def test_other_loaders_show_the_same_image(tmp_path: Path, suffix: str) -> None:
 @pytest.mark.parametrize("suffix", ["obj", "glb"])
 def test_other_loaders_find_every_page(tmp_path: Path, suffix: str) -> None:
     atlas, texture = in_pages(*globe())
-    export_model(tmp_path, atlas, texture, up_axis="+y")
+    export_model(tmp_path, atlas, texture, up_axis="+y", lossless=True)
     scene = trimesh.load_scene(tmp_path / f"model.{suffix}")
     parts = list(scene.geometry.values())
     assert len(parts) == 4
@@ -224,7 +231,7 @@ def test_glb_turns_the_up_axis_to_plus_y(tmp_path: Path, up_axis: str) -> None:
 
 def test_glb_is_compact_and_complete(tmp_path: Path) -> None:
     atlas, texture = globe()
-    export_model(tmp_path, atlas, texture, up_axis="+z")
+    export_model(tmp_path, atlas, texture, up_axis="+z", lossless=True)
     document, binary = glb_chunks(tmp_path / "model.glb")
     indices, positions, normals, uv = (accessor(document, binary, i) for i in range(4))
     mesh = atlas.mesh
@@ -244,6 +251,28 @@ def test_glb_is_compact_and_complete(tmp_path: Path) -> None:
     assert material["doubleSided"] is True
     assert material["pbrMetallicRoughness"]["metallicFactor"] == 0
     assert material["pbrMetallicRoughness"]["roughnessFactor"] == 1
+
+
+def test_glb_carries_a_jpeg_with_all_of_its_chroma(tmp_path: Path) -> None:
+    atlas, texture = globe()
+    export_model(tmp_path, atlas, texture, up_axis="+z")
+    jpeg = embedded_image(tmp_path / "model.glb", "image/jpeg")
+    frame = re.search(rb"\xff[\xc0\xc2]..\x08....\x03(.{9})", jpeg, re.DOTALL)
+    assert frame is not None
+    assert frame[1][1::3] == b"\x11\x11\x11"  # samples of each component along both axes, beside the others'
+    assert len(jpeg) < 0.7 * (tmp_path / "model.png").stat().st_size
+
+
+def test_charts_do_not_bleed_into_each_other_through_the_jpeg(tmp_path: Path) -> None:
+    """Strips of strong colors, each with the two texels of padding around it that charts have."""
+    colors = torch.tensor([[220, 20, 20], [20, 20, 220], [20, 200, 20]], dtype=torch.uint8)
+    texture = colors[torch.arange(96) // 13 % 3].expand(96, 96, 3).contiguous()
+    export_model(tmp_path, replace(globe()[0], width=96, height=96), texture, up_axis="+y")
+    found = cv2.imdecode(np.frombuffer(embedded_image(tmp_path / "model.glb", "image/jpeg"), np.uint8), 1)
+    assert found is not None
+    inside = (np.arange(96) % 13 >= 1) & (np.arange(96) % 13 < 12)  # all that bilinear samples of a chart touch
+    error = np.abs(found[..., ::-1].astype(int) - texture.numpy())[:, inside]
+    assert error.max() <= 12
 
 
 def test_many_vertices_get_wide_indices(tmp_path: Path) -> None:
@@ -278,11 +307,13 @@ def validate(folder: Path, model: Path) -> dict[str, Any]:
     return report
 
 
-@pytest.mark.parametrize("up_axis", ["+z", "-x", "+y"])
-@pytest.mark.parametrize("model", ["globe", "plane", "pages"])
-def test_khronos_validator_finds_nothing(tmp_path: Path, validator: Path, up_axis: str, model: str) -> None:
+@pytest.mark.parametrize("lossless", [False, True])
+@pytest.mark.parametrize(("model", "up_axis"), [("globe", "+z"), ("plane", "-x"), ("pages", "+y")])
+def test_khronos_validator_finds_nothing(
+    tmp_path: Path, validator: Path, model: str, up_axis: str, lossless: bool
+) -> None:
     atlas, texture = {"globe": globe, "plane": lambda: plane(256), "pages": lambda: in_pages(*globe())}[model]()
-    export_model(tmp_path, atlas, texture, up_axis=up_axis)
+    export_model(tmp_path, atlas, texture, up_axis=up_axis, lossless=lossless)
     report = validate(validator, tmp_path / "model.glb")
     assert [issue for issue in report["issues"]["messages"] if issue["severity"] < 2] == []
     assert report["info"]["totalTriangleCount"] == len(atlas.mesh.t_pos_idx)

@@ -34,6 +34,11 @@ def write_zip(path: Path, **changed: bytes) -> Path:
     return path
 
 
+def test_what_is_kept_serves_other_files_of_the_same_texture(folder: Path) -> None:
+    assert fingerprint(folder, replace(CONFIG, lossless=True)) == fingerprint(folder, CONFIG)
+    assert fingerprint(folder, replace(CONFIG, seed=1)) != fingerprint(folder, CONFIG)
+
+
 def test_an_edit_that_keeps_a_files_size_is_another_scan(folder: Path, tmp_path: Path) -> None:
     before = fingerprint(folder, CONFIG)
     assert fingerprint(folder, CONFIG) == before

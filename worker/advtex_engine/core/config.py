@@ -168,6 +168,7 @@ class TextureConfig(Options):
 
     face_budget: int = FACE_BUDGET
     max_views: int = MAX_VIEWS
+    lossless: bool = False
     size: tuple[int, int] | None = None
     texels_per_pixel: float = 1.2
     refine: bool = True

@@ -67,11 +67,13 @@ def to_bytes(picture: Tensor) -> NDArray[np.uint8]:
     return (picture.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
-def encode_jpeg(image: NDArray[np.uint8], quality: int = JPEG_QUALITY) -> bytes:
-    """[H,W,3] uint8 sRGB as a JPEG."""
+def encode_jpeg(image: NDArray[np.uint8], quality: int = JPEG_QUALITY, *, full_chroma: bool = False) -> bytes:
+    """[H,W,3] uint8 sRGB as a JPEG, its chroma halved (4:2:0) or full (4:4:4)."""
     import cv2
 
-    done, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    factor = cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444 if full_chroma else cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420
+    parameters = (cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, factor)
+    done, data = cv2.imencode(".jpg", image[..., ::-1], parameters)
     assert done
     return data.tobytes()
 

@@ -1,8 +1,9 @@
-"""The textured model as files: OBJ + MTL + PNG, and GLB.
+"""The textured model as files: OBJ + MTL + PNG, GLB, and USDZ.
 
 OBJ keeps the scan's world coordinates; its v counts from the image's bottom row, so v is flipped here, once.
 glTF is +Y up: the GLB's node turns the scan's up axis there and leaves the vertices as they are; its uv has the
-same origin as ours. Both carry smooth normals, and one material and sRGB PNG for each page of the atlas.
+same origin as ours. All carry smooth normals, and one material and sRGB image for each page of the atlas: the OBJ a
+PNG, the GLB and the USDZ (`usdz.py`) a JPEG unless they are asked for a PNG.
 """
 
 from __future__ import annotations
@@ -10,21 +11,19 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from advtex_engine.core.scene import TO_Y_UP, Atlas, Mesh
+from advtex_engine.core.scene import TO_Y_UP, Atlas
 from advtex_engine.mesh.normals import vertex_normals
+from advtex_engine.results.images import encode_png, encode_texture
+from advtex_engine.results.pages import Array, Page, on_cpu, split_at_seams, split_pages
+from advtex_engine.results.usdz import write_usdz
 from advtex_engine.runtime.files import atomic_file, write_atomically
-
-Array = NDArray[Any]
 
 LINES_PER_BLOCK = 1 << 16
 """OBJ lines formatted at once: bounds the memory of an export."""
@@ -33,88 +32,48 @@ GLTF_ARRAY_BUFFER, GLTF_ELEMENT_ARRAY_BUFFER = 34962, 34963
 GLTF_LINEAR, GLTF_LINEAR_MIPMAP_LINEAR, GLTF_CLAMP = 9729, 9987, 33071
 
 
-def export_model(out: Path, atlas: Atlas, texture: Tensor, *, up_axis: str, name: str = "model") -> tuple[Path, ...]:
-    """Write `name`.obj, .mtl, .png and .glb into the folder `out`; returns their paths.
+def export_model(
+    out: Path,
+    atlas: Atlas,
+    texture: Tensor,
+    *,
+    up_axis: str,
+    lossless: bool = False,
+    usdz: bool = False,
+    name: str = "model",
+) -> tuple[Path, ...]:
+    """Write `name`.obj, .mtl, .png, .glb and with `usdz` .usdz into the folder `out`; returns their paths.
 
     texture: [atlas.height,atlas.width,3] uint8 sRGB, or float in [0,1] (clamped). Pages after the first are
-    `name`_2.png and so on; a page without faces is left out. Each file is whole or absent; the OBJ comes after the
-    files that it names.
+    `name`_2.png and so on; a page without faces is left out. lossless: GLB and USDZ carry PNGs as well. Each file
+    is whole or absent; the OBJ comes after the files that it names.
     """
     assert texture.shape == (atlas.height, atlas.width, 3)
     assert up_axis in TO_Y_UP
     out.mkdir(parents=True, exist_ok=True)
-    normals = vertex_normals(_on_cpu(atlas.mesh))
-    pages = _split_pages(atlas, texture)
-    obj, mtl, glb = (out / f"{name}.{suffix}" for suffix in ("obj", "mtl", "glb"))
+    normals = vertex_normals(on_cpu(atlas.mesh))
+    pages = split_pages(atlas, texture)
+    obj, mtl, glb, package = (out / f"{name}.{suffix}" for suffix in ("obj", "mtl", "glb", "usdz"))
     images = [out / f"{name}{page.suffix}.png" for page in pages]
     for image, page in zip(images, pages, strict=True):
-        write_atomically(image, page.png)
+        write_atomically(image, encode_png(page.image))
     write_atomically(mtl, "\n".join(map(_mtl, pages, images)).encode())
     _write_obj(obj, pages, normals, mtl.name)
-    _write_glb(glb, pages, normals, up_axis)
-    return obj, mtl, *images, glb
-
-
-@dataclass(frozen=True)
-class _Page:
-    """An image and the faces that it covers. mesh: all vertices, and all uv as they lie on their own page."""
-
-    mesh: Mesh
-    png: bytes
-    suffix: str
-
-    @property
-    def material(self) -> str:
-        return f"textured{self.suffix}"
-
-
-def _split_pages(atlas: Atlas, texture: Tensor) -> list[_Page]:
-    mesh, count = _on_cpu(atlas.mesh), atlas.pages
-    assert mesh.v_uv is not None
-    assert mesh.t_uv_idx is not None
-    assert atlas.width % count == 0
-    assert atlas.height % count == 0
-    cell = (mesh.v_uv * count).floor().clamp(0, count - 1)  # column and row
-    v_uv = mesh.v_uv * count - cell
-    page_of_uv = (cell[:, 1] * count + cell[:, 0]).long()
-    face_page = page_of_uv[mesh.t_uv_idx]
-    assert bool((face_page == face_page[:, :1]).all()), "a face crosses the border of its page"
-    width, height = atlas.width // count, atlas.height // count
-    pages = list[_Page]()
-    for number in torch.unique(face_page[:, 0]).tolist():
-        row, column = divmod(number, count)
-        image = texture[row * height : (row + 1) * height, column * width : (column + 1) * width]
-        mine = face_page[:, 0] == number
-        part = Mesh(mesh.v_pos, mesh.t_pos_idx[mine], v_uv, mesh.t_uv_idx[mine])
-        pages.append(_Page(part, encode_png(image), f"_{len(pages) + 1}" if pages else ""))
-    return pages
-
-
-def encode_png(texture: Tensor) -> bytes:
-    """[H,W,3] uint8 sRGB, or float in [0,1], as a PNG."""
-    image = texture.detach().cpu()
-    if image.dtype != torch.uint8:
-        image = (image.float().clamp(0, 1) * 255).round().to(torch.uint8)
-    done, data = cv2.imencode(".png", np.ascontiguousarray(image.numpy()[..., ::-1]))
-    assert done
-    return data.tobytes()
-
-
-def _on_cpu(mesh: Mesh) -> Mesh:
-    assert mesh.v_uv is not None
-    assert mesh.t_uv_idx is not None
-    return Mesh(mesh.v_pos.cpu(), mesh.t_pos_idx.cpu(), mesh.v_uv.cpu(), mesh.t_uv_idx.cpu())
+    _write_glb(glb, pages, normals, up_axis, lossless)
+    if usdz:
+        write_usdz(package, pages, normals, up_axis, lossless=lossless)
+    return obj, mtl, *images, glb, *([package] if usdz else ())
 
 
 # OBJ
 
 
-def _mtl(page: _Page, image: Path) -> str:
+def _mtl(page: Page, image: Path) -> str:
     """A material that shows the texture as it is: diffuse only (illum 1), no highlight."""
     return f"newmtl {page.material}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {image.name}\n"
 
 
-def _write_obj(path: Path, pages: Sequence[_Page], normals: Tensor, mtl: str) -> None:
+def _write_obj(path: Path, pages: Sequence[Page], normals: Tensor, mtl: str) -> None:
     mesh = pages[0].mesh
     assert mesh.v_uv is not None
     uv = mesh.v_uv.double()
@@ -142,7 +101,7 @@ def _write_lines(file: BinaryIO, line: str, rows: Tensor) -> None:
 # GLB
 
 
-def _write_glb(path: Path, pages: Sequence[_Page], normals: Tensor, up_axis: str) -> None:
+def _write_glb(path: Path, pages: Sequence[Page], normals: Tensor, up_axis: str, lossless: bool) -> None:
     """glTF 2.0 binary: a header, a JSON chunk and a binary chunk, each padded to four bytes."""
     document = _gltf(up_axis)
     chunks, offset = list[bytes](), 0
@@ -156,10 +115,13 @@ def _write_glb(path: Path, pages: Sequence[_Page], normals: Tensor, up_axis: str
         return len(chunks) - 1
 
     for page in pages:
-        arrays = _split_at_seams(page.mesh, normals)
+        arrays = split_at_seams(page.mesh, normals)
         targets = (GLTF_ELEMENT_ARRAY_BUFFER, GLTF_ARRAY_BUFFER, GLTF_ARRAY_BUFFER, GLTF_ARRAY_BUFFER)
         views = [add_view(array.tobytes(), target) for array, target in zip(arrays, targets, strict=True)]
-        _add_page(document, page, arrays, views, add_view(page.png, None))
+        _add_page(document, page, arrays, views)
+        image = encode_texture(page.image, lossless=lossless)
+        view = {"bufferView": add_view(image.data, None), "mimeType": image.media_type}
+        document["images"].append({"name": f"texture{page.suffix}", **view})
     document["buffers"] = [{"byteLength": offset}]
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
@@ -197,10 +159,11 @@ def _gltf(up_axis: str) -> dict[str, Any]:
     }
 
 
-def _add_page(
-    document: dict[str, Any], page: _Page, arrays: tuple[Array, ...], views: Sequence[int], image: int
-) -> None:
-    """A primitive with its material, texture and image. arrays: of `_split_at_seams`, in the buffer views `views`."""
+def _add_page(document: dict[str, Any], page: Page, arrays: tuple[Array, ...], views: Sequence[int]) -> None:
+    """A primitive with its material and texture, which shows the image of the same number.
+
+    arrays: of `split_at_seams`, in the buffer views `views`.
+    """
     indices, positions = arrays[:2]
     first, number = len(document["accessors"]), len(document["materials"])
     vector = {"componentType": GLTF_FLOAT, "count": len(positions), "type": "VEC3"}
@@ -216,24 +179,3 @@ def _add_page(
     shading = {"baseColorTexture": {"index": number}, "metallicFactor": 0.0, "roughnessFactor": 1.0}
     document["materials"].append({"name": page.material, "pbrMetallicRoughness": shading, "doubleSided": True})
     document["textures"].append({"source": number, "sampler": 0})
-    document["images"].append({"name": f"texture{page.suffix}", "bufferView": image, "mimeType": "image/png"})
-
-
-def _split_at_seams(mesh: Mesh, normals: Tensor) -> tuple[Array, Array, Array, Array]:
-    """Vertices that have one position and one uv each: glTF knows no separate indices.
-
-    Returns indices [3T] (uint16 where they fit: 65535 is reserved), positions [N,3], normals [N,3], uv [N,2] float32.
-    """
-    assert mesh.v_uv is not None
-    assert mesh.t_uv_idx is not None
-    uv_count = len(mesh.v_uv)
-    key = (mesh.t_pos_idx * uv_count + mesh.t_uv_idx).flatten()
-    pairs, index = torch.unique(key, return_inverse=True)
-    position, corner = pairs // uv_count, pairs % uv_count
-    dtype = np.uint16 if len(pairs) < 65535 else np.uint32
-    return (
-        index.numpy().astype(dtype),
-        mesh.v_pos[position].numpy().astype("<f4"),
-        normals[position].numpy().astype("<f4"),
-        mesh.v_uv[corner].numpy().astype("<f4"),
-    )

@@ -11,7 +11,8 @@ from advtex_engine.core.config import PRESETS, TextureConfig
 from advtex_engine.ingest.read import opened
 from advtex_engine.runtime.checkpoint import FORMAT
 
-NO_RESULT = ("device", "checkpoint_seconds", "memory_bytes")  # options that the result does not depend on
+# Options on which nothing that is kept depends: neither the texture, nor what it is made of.
+NO_RESULT = ("device", "checkpoint_seconds", "memory_bytes", "lossless")
 
 
 def fingerprint(scan: Path, config: TextureConfig) -> str:

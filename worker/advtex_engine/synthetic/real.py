@@ -234,7 +234,7 @@ def _write(
         suffix = "jpg" if errors.jpeg and images == "color" else "png"
         (place / "scan.json").write_text(json.dumps(_scan(place, views, images, suffix, scene), indent=1))
     texture = _shown(drawn.radiance, heldout[0].exposure.gain)
-    export_model(folder / "truth", drawn.atlas, texture, up_axis="+z", name="object")
+    export_model(folder / "truth", drawn.atlas, texture, up_axis="+z", lossless=True, name="object")
     truth = {
         "width": shots[0].camera.width,
         "height": shots[0].camera.height,

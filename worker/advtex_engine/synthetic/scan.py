@@ -207,7 +207,7 @@ def _write_scan(folder: Path, views: int, width: int, height: int, seed: int, er
         ],
     }
     (folder / "scan.json").write_text(json.dumps(scan, indent=1))
-    export_model(folder / "truth", atlas, texture, up_axis="+z", name="object")
+    export_model(folder / "truth", atlas, texture, up_axis="+z", lossless=True, name="object")
     truth = {
         "width": width,
         "height": height,

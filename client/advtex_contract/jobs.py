@@ -8,9 +8,9 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, computed_field, model_validator
 
-from advtex_contract.errors import ErrorDetail
+from advtex_contract.errors import JOB_EXPLANATIONS, ErrorDetail
 from advtex_contract.options import JobOptions
 from advtex_contract.stored_options import AnyOptions
 
@@ -162,12 +162,20 @@ class ResultFile(BaseModel):
 
 
 class JobError(BaseModel):
-    """Why a job failed or was rejected, in words, with the remedy and the log's tail."""
+    """Why a job failed or was rejected, in words, with the remedy and the log's tail.
+
+    help: where the server explains the code, a path on it; empty for a code that is not its own.
+    """
 
     code: str
     message: str
     details: list[ErrorDetail] = Field(default_factory=list)
     log_tail: str = ""
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def help(self) -> str:
+        return f"/errors#job-{self.code}" if self.code in JOB_EXPLANATIONS else ""
 
 
 class JobView(BaseModel):

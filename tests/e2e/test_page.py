@@ -109,6 +109,23 @@ def grown(path: Path, megabytes: int) -> Path:
     return path
 
 
+def test_the_api_is_tried_out_from_its_description(web: Browsing) -> None:
+    """Everything comes from the server itself: the policy would stop what does not, and be noted as a problem."""
+    page = web.page(signed_in=False)
+    page.goto("/docs")
+    page.get_by_role("button", name="Authorize").click()
+    page.get_by_label("Value").fill(web.service.key)
+    page.get_by_role("button", name="Apply credentials").click()
+    page.get_by_role("button", name="Close", exact=True).click()
+    call = page.locator("[id^=operations-keys-get_key]")
+    call.locator(".opblock-summary-control").click()
+    call.get_by_role("button", name="Try it out").click()
+    call.get_by_role("button", name="Execute").click()
+    expect(call.locator(".live-responses-table .response-col_status").last).to_contain_text("200")
+    expect(call.locator(".live-responses-table")).to_contain_text('"scopes"')
+    page.screenshot(path=web.pictures / "api.png")
+
+
 def test_a_wrong_key_and_a_session_that_ends(web: Browsing, archive: Path) -> None:
     page = web.page(signed_in=False)
     page.goto("/new")

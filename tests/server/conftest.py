@@ -165,8 +165,8 @@ def is_error(response: httpx.Response, status: int, code: str) -> str:
     """Whether it is the one error body. -> the message"""
     assert response.status_code == status, response.text
     body = response.json()
-    assert set(body) == {"code", "message", "details"}
-    assert body["code"] == code
+    assert set(body) == {"code", "message", "details", "help"}
+    assert (body["code"], body["help"]) == (code, f"/errors#{code}")
     assert body["message"]
     return str(body["message"])
 

@@ -15,7 +15,8 @@ from typing import Any
 import httpx
 import pytest
 
-from advtex_contract.jobs import RETRYABLE, STATES, TERMINAL
+from advtex_contract.errors import JOB_EXPLANATIONS, ErrorCode
+from advtex_contract.jobs import RETRYABLE, STATES, TERMINAL, JobError
 from advtex_contract.options import JobOptions
 from advtex_contract.stages import STAGE_LABELS
 from advtex_server import static_files
@@ -291,12 +292,42 @@ def test_files_are_kept_by_browsers_until_they_change(live: Any) -> None:
             assert http.get(f"/static/{static_files.version()}/{name}").status_code == 404
 
 
+def test_every_code_of_an_error_is_explained_where_its_body_says(live: Any) -> None:
+    with live.client(None) as http:
+        page = http.get("/errors").text
+        refused = http.get("/v1/jobs").json()
+    places = set(re.findall(r'<div id="([\w-]+)">', page))
+    assert {f"job-{code}" for code in JOB_EXPLANATIONS} <= places
+    assert {code.value for code in ErrorCode} <= places, "each is in the catalogue"
+    assert refused["help"].removeprefix("/errors#") in places
+    assert JobError(code="poison", message="").help.removeprefix("/errors#") in places
+    assert JobError(code="of_another_package", message="").help == ""
+
+
+def test_the_catalogue_has_all_that_a_job_can_end_with() -> None:
+    root = Path(__file__).parents[2]
+    sources = [
+        path
+        for room in ("server/advtex_server", "server/advtex_store", "worker/advtex_worker")
+        for path in (root / room).rglob("*.py")
+    ]
+    told = {
+        code for path in sources for code in re.findall(r'(?:JobError|FailedEvent)\(\s*code="(\w+)"', path.read_text())
+    }
+    assert {"poison", "scan_missing", "engine_error"} < told
+    assert told <= set(JOB_EXPLANATIONS)
+
+
 def test_vendored_files_are_what_the_list_says() -> None:
     folder = static_files.FOLDER / "vendor"
     listed = dict(
         re.findall(r"^\| `([\w.-]+)` .* `([0-9a-f]{64})` \|$", (folder / "VENDORED.md").read_text(), re.MULTILINE)
     )
-    assert listed == {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.glob("*.js")}
+    assert listed == {
+        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in folder.iterdir()
+        if path.suffix in static_files.SUFFIXES
+    }
 
 
 def test_the_first_page_is_small_and_fast(live: Any, browser: httpx.Client) -> None:

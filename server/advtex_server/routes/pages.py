@@ -15,7 +15,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse, StreamingResponse
 from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
 
-from advtex_contract.errors import ErrorCode
+from advtex_contract.errors import EXPLANATIONS, JOB_EXPLANATIONS, ErrorCode
 from advtex_contract.jobs import RETRYABLE, STATES, JobState, Label
 from advtex_contract.options import PRESET_COST, PRESET_HELP, Preset
 from advtex_contract.stages import STAGE_LABELS
@@ -27,7 +27,7 @@ from advtex_server.browsers import BrowserSessions, check_same_origin, cookie_na
 from advtex_server.deps import TheService
 from advtex_server.errors import noted
 from advtex_server.overview import job_summary, stream_changes
-from advtex_server.refusal import ApiError
+from advtex_server.refusal import STATUS, ApiError
 from advtex_server.routes.jobs import JobId
 from advtex_server.streams import while_welcome
 from advtex_store.accounts import Caller
@@ -46,6 +46,7 @@ VIEWER_POLICY = (
     .replace("img-src 'self' data:", "img-src 'self' data: blob:")
     .replace("connect-src 'self'", "connect-src 'self' blob:")
 )
+DOCS_POLICY = POLICY.replace("style-src 'self'", "style-src 'self' 'unsafe-inline'")  # Swagger UI styles itself
 _RETURN = re.compile(r"/(new|jobs/[0-9A-Za-z_-]{1,64})?(\?[A-Za-z0-9._%&=-]*)?")
 _WORDS = {
     "states": {
@@ -143,6 +144,19 @@ async def job_page(job_id: JobId, request: Request, service: TheService) -> Resp
     caller = await _reader(request)
     job = await run_in_threadpool(service.job, caller.owner, job_id)
     return _page("job.html", caller, VIEWER_POLICY, job=job, data=job.model_dump(mode="json"))
+
+
+@router.get("/docs")
+async def docs_page(request: Request) -> Response:
+    """The API, to read and to try out with a key."""
+    return _page("docs.html", await _sessions(request).find(request), DOCS_POLICY)
+
+
+@router.get("/errors")
+async def errors_page(request: Request) -> Response:
+    """What each code of an error means, and what helps."""
+    caller = await _sessions(request).find(request)
+    return _page("errors.html", caller, answers=EXPLANATIONS, jobs=JOB_EXPLANATIONS, statuses=STATUS)
 
 
 @router.get("/changes")

@@ -58,7 +58,7 @@ function ending() {
   if (!error) return [];
   const log = error.log_tail && el("details", { open: true }, el("summary", {}, "The end of the log"), el("pre", { tabIndex: 0, role: "region", "aria-label": "The end of the log" }, error.log_tail));
   return [
-    el("p", { class: "problem" }, error.message),
+    el("p", { class: "problem" }, error.message, " ", error.help && el("a", { href: error.help }, "What this means")),
     error.details.length > 0 && el("ul", { class: "findings", "aria-label": "Problems of the scan" }, findings(error.details)), log,
     job.state === "rejected" && el("p", { class: "hint" }, "Correct the scan and send it again as a new one."),
   ];

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from advtex_scan import CheckReport, ScanFormatError, check_scan, open_remote
-from advtex_store.supervision import die_with_parent
+from advtex_store.process_ends import die_with_parent
 
 LENGTH = struct.Struct("<Q")
 

@@ -35,10 +35,10 @@ from advtex_store.errors import (
     StoreError,
 )
 from advtex_store.memory_estimate import needed_memory
+from advtex_store.process_ends import how_it_ended
 from advtex_store.references import RemoteScan
 from advtex_store.secrecy import public_environment
 from advtex_store.store import Store
-from advtex_store.supervision import how_it_ended
 
 COMMAND = (sys.executable, "-m", "advtex_server.check_process")
 PROCESSES = 2

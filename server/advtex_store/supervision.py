@@ -1,9 +1,7 @@
-"""Child processes of server and worker: they die with their parent, start again when they die first, and how one ended
-is put into words."""
+"""Child processes of server and worker: they die with their parent, and start again when they die first."""
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import subprocess
@@ -14,7 +12,8 @@ from contextlib import suppress
 
 import structlog
 
-PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
+from advtex_store.process_ends import die_with_parent, how_it_ended
+
 RESTART_SECONDS = (1.0, 2.0, 5.0, 10.0, 30.0)  # pauses before further starts of a child that keeps dying
 STEADY_SECONDS = 60.0  # a child that lived this long starts again at the shortest pause
 
@@ -103,30 +102,3 @@ class Supervised:
             os.killpg(self._process.pid, signal.SIGKILL)
             self._process.wait()
         log.info("stopped", child=self.name, exit_code=self._process.returncode)
-
-
-def die_with_parent(parent_pid: int, signum: signal.Signals) -> None:
-    """Have the kernel (Linux) send `signum` to this process when its parent ends.
-
-    The kernel watches the thread that made this process, so parents start children from a thread that lives as long
-    as they do. If the parent was gone before the call, this process exits at once.
-    """
-    if not sys.platform.startswith("linux"):
-        return
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.prctl(PR_SET_PDEATHSIG, int(signum), 0, 0, 0) != 0:
-        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG) failed")
-    if os.getppid() != parent_pid:
-        os._exit(1)
-
-
-def how_it_ended(code: int) -> str:
-    """How a process ended, for people, as the end of a sentence about it: its return code as `subprocess` gives it."""
-    if code >= 0:
-        return f"ended without a result (exit code {code})"
-    known = {signal.SIGKILL: "was killed (out of memory?)", signal.SIGSEGV: "crashed in native code"}
-    try:
-        signum = signal.Signals(-code)
-    except ValueError:
-        return f"was ended by signal {-code}"
-    return f"{known.get(signum, 'was ended')}: {signum.name}"

@@ -98,9 +98,9 @@ def views_of(picture: Tensor, size: int, shift: int) -> tuple[Tensor, Tensor, Te
     return color, truth, color.float().median(0).values / 255
 
 
-def ratio(picture: Tensor, steps: int, *, auxiliary: bool, seed: int = 0) -> float:
-    """Sliced Wasserstein distance of the texture's patches to the truth's, over that of the L1 optimum's."""
-    color, truth, l1_optimum = views_of(picture, SIZE, SHIFT)
+def ratio(size: int, shift: int, steps: int, *, auxiliary: bool, seed: int = 0) -> float:
+    """Sliced Wasserstein distance of the texture's patches to the drawn truth's, over that of the L1 optimum's."""
+    color, truth, l1_optimum = views_of(drawn_picture(size + 2 * shift), size, shift)
     *_, (_, texture) = optimize(color, steps, auxiliary=auxiliary, seed=seed)
     return sliced_wasserstein(texture, truth) / sliced_wasserstein(l1_optimum, truth)
 

@@ -7,18 +7,18 @@ from pathlib import Path
 import planar
 import pytest
 
-STEPS = 2000
+SIZE, SHIFT, STEPS = 96, 6, 1200
 
 
 @pytest.mark.slow
 def test_auxiliary_views_make_the_texture_sharp() -> None:
     """At most 0.45 of the L1 optimum's distance to the truth's patches."""
-    assert planar.ratio(planar.drawn_picture(), STEPS, auxiliary=True) <= 0.45
+    assert planar.ratio(SIZE, SHIFT, STEPS, auxiliary=True) <= 0.45
 
 
 @pytest.mark.slow
 def test_without_auxiliary_views_it_does_not_become_sharp() -> None:
-    assert planar.ratio(planar.drawn_picture(), STEPS, auxiliary=False) > 0.85
+    assert planar.ratio(SIZE, SHIFT, STEPS, auxiliary=False) > 0.85
 
 
 def test_a_run_is_reported_and_not_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

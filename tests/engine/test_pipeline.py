@@ -141,9 +141,7 @@ def test_a_stopped_run_resumes_to_the_same_bytes_without_redoing_earlier_stages(
     assert [point["step"] for point in report["losses"]] == list(range(1, STEPS + 1))
 
 
-def test_without_resume_and_with_other_options_the_work_folder_is_not_used(
-    scan: Path, whole: tuple[Path, Recorder], tmp_path: Path
-) -> None:
+def test_without_resume_and_with_other_options_the_work_folder_is_not_used(scan: Path, tmp_path: Path) -> None:
     with pytest.raises(Stopped):
         texture_scan(scan, tmp_path, CONFIG, work=tmp_path / "work", monitor=Recorder(stop_at=5))
     other = TextureConfig(preset="standard", steps=STEPS, holdout=6, face_budget=3000, device="cpu")
@@ -295,12 +293,21 @@ def test_a_resumed_run_keeps_the_warnings_of_stages_that_it_takes_over(tmp_path:
     assert again.warnings[0]["remedy"] == "look at it"
 
 
-def test_the_pyramid_starts_small_and_ends_at_full_size(scan: Path, tmp_path: Path) -> None:
-    config = TextureConfig(preset="preview", steps=STEPS, face_budget=4000, device="cpu")
+PYRAMID = TextureConfig(preset="preview", steps=STEPS, face_budget=4000, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def pyramid(scan: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Recorder]:
+    out = tmp_path_factory.mktemp("pyramid")
     recorder = Recorder()
-    result = texture_scan(scan, tmp_path, config, work=tmp_path / "work", monitor=recorder)
+    texture_scan(scan, out, PYRAMID, work=out / "work", monitor=recorder)
+    return out, recorder
+
+
+def test_the_pyramid_starts_small_and_ends_at_full_size(pyramid: tuple[Path, Recorder]) -> None:
+    out, recorder = pyramid
     assert {"view_maps_1.pt", "view_maps_2.pt"} <= recorder.files
-    levels = result.report["preset"]["levels"]
+    levels = json.loads((out / "report.json").read_text())["preset"]["levels"]
     assert sum(level["steps"] for level in levels) == STEPS
     assert [level["scale"] for level in levels] == [2, 1]
     assert recorder.steps[-1] == STEPS
@@ -308,14 +315,12 @@ def test_the_pyramid_starts_small_and_ends_at_full_size(scan: Path, tmp_path: Pa
 
 @pytest.mark.parametrize("stop_at", [7, 21])
 def test_a_pyramid_that_is_stopped_at_either_level_resumes_to_the_same_bytes(
-    scan: Path, tmp_path: Path, stop_at: int
+    scan: Path, pyramid: tuple[Path, Recorder], tmp_path: Path, stop_at: int
 ) -> None:
-    config = TextureConfig(preset="preview", steps=STEPS, face_budget=4000, device="cpu")
-    texture_scan(scan, tmp_path / "whole", config, work=tmp_path / "work")
     with pytest.raises(Stopped, match=f"step {stop_at} of"):
-        texture_scan(scan, tmp_path / "two", config, work=tmp_path / "work2", monitor=Recorder(stop_at=stop_at))
-    texture_scan(scan, tmp_path / "two", config, work=tmp_path / "work2", resume=True)
-    assert filecmp.cmp(tmp_path / "whole" / "model.png", tmp_path / "two" / "model.png", shallow=False)
+        texture_scan(scan, tmp_path, PYRAMID, work=tmp_path / "work", monitor=Recorder(stop_at=stop_at))
+    texture_scan(scan, tmp_path, PYRAMID, work=tmp_path / "work", resume=True)
+    assert filecmp.cmp(pyramid[0] / "model.png", tmp_path / "model.png", shallow=False)
 
 
 def test_the_mean_method_takes_no_steps(scan: Path, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import statistics
+import subprocess
 import sys
 import threading
 import time
@@ -285,3 +286,11 @@ def test_jobs_that_are_checked_are_counted_and_listed(
     batch = live.http.get("/v1/batches/b").json()
     assert (batch["states"], batch["finished"]) == ({"checking": 3}, False)
     assert live.http.post("/v1/batches/b/cancel").json()["states"] == {"canceled": 3}
+
+
+def test_the_process_of_a_check_begins_with_little() -> None:
+    """Each scan waits for what its process imports first."""
+    loaded = "import sys, advtex_server.check_process; print(*sys.modules)"
+    modules = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, check=True).stdout.split()
+    assert {"advtex_scan", "advtex_store"} <= set(modules)
+    assert not {"structlog", "rich", "asyncio", "pydantic", "sqlalchemy", "httpx"} & set(modules)

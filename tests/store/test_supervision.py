@@ -13,7 +13,8 @@ from typing import Any
 import psutil
 import pytest
 
-from advtex_store.supervision import Supervised, how_it_ended
+from advtex_store.process_ends import how_it_ended
+from advtex_store.supervision import Supervised
 
 PARENT = """
 import os, time

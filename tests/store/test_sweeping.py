@@ -202,8 +202,7 @@ class World:
             for upload in uploads:
                 assert self.blobs.is_published(keys.scan_key(upload.id), SIZE), "a scan was removed"
             begun = session.query(UploadRow).filter(UploadRow.deleted_at.is_(None), UploadRow.sha256.is_(None))
-            for upload in begun.filter(UploadRow.offset > 0):
-                self.check_pieces(upload)
+            self.check_pieces(begun.filter(UploadRow.offset > 0).all())
             for job in session.query(JobRow).filter(JobRow.deleted_at.is_(None)):
                 for entry in job.results:
                     assert self.blobs.exists(entry["key"]), "a result was removed"
@@ -212,13 +211,15 @@ class World:
                 elif job.state == "running":
                     assert self.blobs.exists(keys.checkpoint_prefix(job.id, job.attempt) + "1/0")
 
-    def check_pieces(self, row: UploadRow) -> None:
-        """What the row calls durable can be gone on with."""
-        key = keys.scan_key(row.id)
-        self.resumed(row).close()  # else BlobNotFound
-        if isinstance(self.blobs, S3Blobs) and not self.blobs.is_published(key, SIZE):
-            held = [found.upload_id for found in self.blobs.unpublished(keys.SCANS) if found.key == key]
-            assert self.blobs.get(key + MULTIPART_SUFFIX).decode() in held, "parts were removed"
+    def check_pieces(self, rows: list[UploadRow]) -> None:
+        """What the rows call durable can be gone on with."""
+        for row in rows:
+            self.resumed(row).close()  # else BlobNotFound
+        if isinstance(self.blobs, S3Blobs):
+            begun = set(self.blobs.bucket.begun("scans"))
+            for key in (keys.scan_key(row.id) for row in rows):
+                if not self.blobs.is_published(key, SIZE):
+                    assert (key, self.blobs.get(key + MULTIPART_SUFFIX).decode()) in begun, "parts were removed"
 
     def end(self) -> None:
         """Without rows, nothing is kept for long."""

@@ -18,6 +18,8 @@ from live_service import wait_until
 from advtex_contract.jobs import JobState
 from advtex_store import keys
 from advtex_store.errors import BlobsUnavailable
+from advtex_store.live_progress import LiveProgress
+from advtex_store.queue import connect_redis_briefly
 from advtex_store.results import Results
 from advtex_store.store import Store
 from advtex_worker.settings import WorkerSettings
@@ -103,16 +105,29 @@ def test_a_cancel_does_not_wait_for_the_storage(
 @pytest.mark.parametrize("asked_before", [False, True])
 @pytest.mark.parametrize(("engine", "ends"), [("hangs", "stopped"), ("ignores_stop", "stopped"), ("hangs_alone", None)])
 def test_a_cancel_in_a_long_stage_is_recorded_within_two_seconds(
-    store: Store, settings: WorkerSettings, new_job: NewJob, engine: str, ends: str | None, asked_before: bool
+    store: Store,
+    settings: WorkerSettings,
+    redis_url: str,
+    new_job: NewJob,
+    engine: str,
+    ends: str | None,
+    asked_before: bool,
 ) -> None:
     """The runner ends by itself; only one that cannot run Python at all is killed. A drain before changes nothing."""
     names = ("lease_seconds", "heartbeat_seconds", "grace_seconds")
     usual = {name: WorkerSettings.model_fields[name].default for name in names}
-    given = Host(settings.model_copy(update=usual), engine=f"fake_engines:{engine}")
+    given = Host(settings.model_copy(update={**usual, "redis_url": redis_url}), engine=f"fake_engines:{engine}")
+    live = LiveProgress(connect_redis_briefly(given.settings))  # the row itself waits for a heartbeat
     job_id = new_job()
+
+    def stage() -> str:
+        row = store.records.job(job_id)
+        live.show([row])
+        return str(row.progress["stage"])
+
     with structlog.testing.capture_logs() as lines:
         thread = in_background(given, job_id)
-        wait_until(lambda: store.records.job(job_id).progress["stage"] != "")
+        wait_until(lambda: stage() != "")
         if asked_before:
             given.stop_signal._on_signal(signal.SIGTERM, None)
         asked = time.monotonic()
@@ -120,6 +135,7 @@ def test_a_cancel_in_a_long_stage_is_recorded_within_two_seconds(
         wait_until(lambda: store.records.job(job_id).state == JobState.canceled)
         took = time.monotonic() - asked
         thread.join()
+    live.redis.close()
     assert took < 2.0
     (ending,) = [line["ending"] for line in lines if line["event"] == "runner ended"]
     assert ending == (ends or "the engine's process was killed (out of memory?): SIGKILL")

@@ -33,9 +33,9 @@ from advtex_store.errors import (
     StoreError,
 )
 from advtex_store.files import translated
+from advtex_store.process_ends import how_it_ended
 from advtex_store.records import Claim
 from advtex_store.store import Store
-from advtex_store.supervision import how_it_ended
 from advtex_worker.checkpoints import CheckpointUploader, restore
 from advtex_worker.child import Child
 from advtex_worker.events import (

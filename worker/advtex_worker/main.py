@@ -31,9 +31,9 @@ from advtex_scan.version import product_version
 from advtex_store.database import read_schema
 from advtex_store.errors import SchemaRefused
 from advtex_store.logs import configure_logs
+from advtex_store.process_ends import die_with_parent
 from advtex_store.queue import JobQueue, attempt_of, class_of, connect_redis, queue_name
 from advtex_store.secrecy import hide_environment
-from advtex_store.supervision import die_with_parent
 from advtex_worker.settings import WorkerSettings
 from advtex_worker.slots import Slot, find_slots, hold, settings_of, supervise
 from advtex_worker.tasks import Host, serve_as

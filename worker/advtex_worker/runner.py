@@ -26,7 +26,7 @@ from advtex_contract.errors import ErrorDetail
 from advtex_contract.live import LiveRecord
 from advtex_engine.core.errors import EngineError, MemoryShortage, OptionError, Problem, ScanError, Stopped
 from advtex_engine.core.monitor import Glimpse, Monitor
-from advtex_store.supervision import die_with_parent
+from advtex_store.process_ends import die_with_parent
 from advtex_worker.adapt import texture_config
 from advtex_worker.events import (
     CANCEL_LINE,

@@ -109,13 +109,19 @@ print(json.dumps(texture_scan(Path(scan), Path(folder), config, work=Path(folder
 """
 
 
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scan") / "scan"
+    synthesize(path, views=16, width=640, height=480)
+    return path
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["standard", "paper"])
-def test_a_whole_run_uses_what_was_estimated(preset: str, tmp_path: Path) -> None:
+def test_a_whole_run_uses_what_was_estimated(preset: str, scan: Path, tmp_path: Path) -> None:
     """Within 15 %; in a process of its own, since one that has done other work has its libraries already."""
-    synthesize(tmp_path / "scan", views=16, width=640, height=480)
     done = subprocess.run(
-        [sys.executable, "-c", RUN, str(tmp_path / "scan"), str(tmp_path / "out"), preset],
+        [sys.executable, "-c", RUN, str(scan), str(tmp_path / "out"), preset],
         stdout=subprocess.PIPE,
         text=True,
         check=True,

@@ -191,8 +191,8 @@ def average(mean: Tensor, state: Tensor, weight: Tensor) -> None:
     kernels.average[_programs(mean.numel(), LONG_BLOCK)](mean, state, weight, COUNT=mean.numel(), BLOCK=LONG_BLOCK)
 
 
-def _programs(count: int, block: int = BLOCK) -> tuple[int]:
-    return (-(-count // block),)
+def _programs(count: int, block: int | None = None) -> tuple[int]:
+    return (-(-count // (block or BLOCK)),)
 
 
 def _image(shape: tuple[int, ...] | torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:

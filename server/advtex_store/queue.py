@@ -109,11 +109,19 @@ class JobQueue:
         names = sorted(_text(key).removeprefix(PRESENCE) for key in found)
         return [name for name in names if not host or name.rpartition("-")[0] == host]
 
+    def any_busy(self, host: str) -> bool:
+        """Whether a worker of the host has a job."""
+        return any(told.endswith(BUSY) for told in self._announced(host))
+
+    def _announced(self, host: str = "") -> list[str]:
+        """What the living workers tell."""
+        names = self.workers(host)
+        told = self.redis.mget([PRESENCE + name for name in names]) if names else []
+        return [_text(value) for value in told if value is not None]
+
     def classes(self) -> list[WorkerClass]:
         """The classes of which workers live, smallest first."""
-        names = self.workers()
-        told = self.redis.mget([PRESENCE + name for name in names]) if names else []
-        known = [_text(value) for value in told if value is not None]
+        known = self._announced()
         count = Counter(int(value.removesuffix(BUSY)) for value in known)
         idle = Counter(int(value) for value in known if not value.endswith(BUSY))
         return [WorkerClass(gib, workers, idle[gib]) for gib, workers in sorted(count.items())]

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import signal
 import sqlite3
 import time
 from pathlib import Path
 
-import fake_engines
 import pytest
 from live_service import LiveService, process_tree, wait_until
+from outcomes import assert_done_once
 
 from advtex_client import Client
-from advtex_contract.jobs import JobState, JobView
+from advtex_contract.jobs import JobState
 from advtex_contract.options import JobOptions
 from advtex_store import keys
 
@@ -33,27 +32,11 @@ def begin(service: LiveService, client: Client, scan: Path, steps: int = STEPS) 
     return job.id, tree
 
 
-def assert_done_once(service: LiveService, client: Client, job_id: str, steps: int = STEPS) -> dict[str, list[int]]:
-    """Every step counts once in the result, and there is one manifest. -> the engine's own account."""
-    job: JobView = client.wait_for_job(job_id, timeout=60)
-    (result,) = [file for file in job.results if file.name == "model.obj"]
-    manifest = service.store.results.manifest(job_id)
-    text = b"".join(
-        chunk for file in manifest.files if file.name == "model.obj" for chunk in service.store.blobs.stream(file.key)
-    )
-    assert len(text) == result.size
-    state = json.loads(text.decode().split("\n", 1)[1])
-    assert state["step"] == steps
-    assert state["chain"] == fake_engines.chain(steps)
-    assert {file.key.split("/")[3] for file in manifest.files} == {str(manifest.attempt)}
-    return state
-
-
 def test_the_runner_alone(service: LiveService, scan: Path) -> None:
     with service.client() as client:
         job_id, (_, _, runner) = begin(service, client, scan)
         os.kill(runner, signal.SIGKILL)
-        state = assert_done_once(service, client, job_id)
+        state = assert_done_once(service, client, job_id, STEPS)
         assert len(state["began"]) == 2
         assert state["began"][1] >= 10
         assert client.get_job(job_id).attempt == 2
@@ -64,7 +47,7 @@ def test_the_work_horse_alone(service: LiveService, scan: Path) -> None:
         job_id, (_, horse, runner) = begin(service, client, scan)
         os.kill(horse, signal.SIGKILL)
         wait_until(lambda: runner not in process_tree(runner), seconds=2.0)
-        state = assert_done_once(service, client, job_id)
+        state = assert_done_once(service, client, job_id, STEPS)
         assert state["began"][1] >= 10
 
 
@@ -75,7 +58,7 @@ def test_the_worker_alone_takes_its_horse_and_runner_with_it(service: LiveServic
         wait_until(lambda: not any(process_tree(pid) for pid in tree[1:]), seconds=5.0)
         assert client.get_job(job_id).state is JobState.preempted, "the horse had time to give its job back"
         service.start_worker("stepping")
-        state = assert_done_once(service, client, job_id)
+        state = assert_done_once(service, client, job_id, STEPS)
         assert state["began"][1] >= 15
 
 
@@ -85,7 +68,7 @@ def test_the_whole_tree(service: LiveService, scan: Path) -> None:
         for pid in tree:
             os.kill(pid, signal.SIGKILL)
         service.start_worker("stepping")
-        state = assert_done_once(service, client, job_id)
+        state = assert_done_once(service, client, job_id, STEPS)
         assert state["began"][1] >= 10
         assert client.get_job(job_id).attempt == 2
 
@@ -107,7 +90,7 @@ def test_a_stopped_worker_that_wakes_up_late_commits_nothing(service: LiveServic
         wait_until(lambda: client.get_job(job_id).attempt == 2)
         for pid in tree:
             os.kill(pid, signal.SIGCONT)
-        state = assert_done_once(service, client, job_id)
+        state = assert_done_once(service, client, job_id, STEPS)
         assert len(state["began"]) == 2
         wait_until(lambda: len(process_tree(tree[0])) == 1, seconds=5.0)  # it waits for the next job
 
@@ -138,5 +121,5 @@ def test_cancel_stops_a_running_job_within_two_seconds_and_retry_goes_on(service
         reached = client.get_job(job_id).progress.step
         wait_until(lambda: len(process_tree(tree[0])) == 1, seconds=5.0)  # horse and runner are gone
         client.retry_job(job_id)
-        state = assert_done_once(service, client, job_id)
+        state = assert_done_once(service, client, job_id, STEPS)
         assert state["began"][1] >= reached

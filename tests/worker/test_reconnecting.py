@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +9,7 @@ import pytest
 import redis.exceptions
 
 from advtex_store.queue import connect_redis
+from advtex_worker.leaving import Departure, Stay
 from advtex_worker.main import JobWorker
 from advtex_worker.tasks import Host
 
@@ -19,7 +19,7 @@ def test_what_listened_to_a_redis_that_is_gone_ends(
 ) -> None:
     settings = host("quick").settings.model_copy(update={"redis_url": own_redis.url})
     connection = connect_redis(settings)
-    worker = JobWorker(Host(settings), connection, threading.Event(), 8)
+    worker = JobWorker(Host(settings), connection, Departure(Stay(), 1.0), 8)
 
     def lose(*_: object) -> None:
         own_redis.stop()

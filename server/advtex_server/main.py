@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -15,6 +15,7 @@ import typer
 from advtex_options.flags import version_flag
 from advtex_server.embedded import SetupError
 from advtex_server.health import checks
+from advtex_server.serving import dispatch as run_dispatcher
 from advtex_server.serving import serve as run_server
 from advtex_server.serving import up as run_all
 from advtex_server.settings import ServerSettings
@@ -62,14 +63,31 @@ def up(
     """Run everything on this machine: API, Redis, database and one worker."""
     configure_logs()
     settings = ServerSettings() if data_dir is None else ServerSettings(data_dir=data_dir)
-    _guarded(run_all, settings, host, port)
+    with _told(SetupError, SchemaRefused):
+        run_all(settings, host, port)
 
 
 @app.command()
-def serve(host: Host = "0.0.0.0", port: Port = 8000) -> None:  # noqa: S104  a server in a container
+def serve(
+    host: Host = "0.0.0.0",  # noqa: S104  a server in a container
+    port: Port = 8000,
+    dispatch: Annotated[
+        bool,
+        typer.Option("--dispatch/--no-dispatch", help="whether it dispatches too, or `advtex-server dispatch` does"),
+    ] = True,
+) -> None:
     """Run the API alone; workers, Redis and database are elsewhere."""
     configure_logs()
-    _guarded(run_server, ServerSettings(), host, port)
+    with _told(SetupError, SchemaRefused):
+        run_server(ServerSettings(), host, port, dispatch=dispatch)
+
+
+@app.command()
+def dispatch() -> None:
+    """Run what servers with --no-dispatch leave: hand out jobs, put right, check scans, deliver webhooks."""
+    configure_logs()
+    with _told(SchemaRefused):
+        run_dispatcher(ServerSettings())
 
 
 @app.command()
@@ -219,13 +237,6 @@ def _told(*errors: type[Exception]) -> Iterator[None]:
     except errors as error:
         typer.echo(f"advtex-server: {error}", err=True)
         raise typer.Exit(1) from None
-
-
-def _guarded(
-    command: Callable[[ServerSettings, str, int], None], settings: ServerSettings, host: str, port: int
-) -> None:
-    with _told(SetupError, SchemaRefused):
-        command(settings, host, port)
 
 
 if __name__ == "__main__":

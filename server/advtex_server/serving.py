@@ -1,4 +1,5 @@
-"""Running the application: alone (`serve`), or with its Redis and one worker (`up`)."""
+"""Running the application: alone (`serve`), its background alone (`dispatch`), or both with a Redis and one worker
+(`up`)."""
 
 from __future__ import annotations
 
@@ -14,13 +15,16 @@ from collections.abc import Callable, Iterator, Sequence
 
 import uvicorn
 
+from advtex_options.methods import known_methods
 from advtex_server.app import create_app
+from advtex_server.background import Background
 from advtex_server.embedded import EmbeddedRedis, SetupError, client_key, only_one
 from advtex_server.settings import ServerSettings
 from advtex_store.accounts import Accounts, key_id
 from advtex_store.database import Database, upgrade_database
 from advtex_store.secrecy import hide_environment
 from advtex_store.sessions import Sessions
+from advtex_store.store import open_store
 from advtex_store.supervision import Supervised
 
 WORKER_STOP_SECONDS = 60.0  # a worker writes its checkpoint in this time
@@ -35,11 +39,29 @@ class _Server(uvicorn.Server):
         yield
 
 
-def serve(settings: ServerSettings, host: str, port: int) -> None:
-    """The API with its dispatcher, until a signal comes. SetupError, SchemaRefused."""
+def serve(settings: ServerSettings, host: str, port: int, *, dispatch: bool = True) -> None:
+    """The API, with its dispatcher or without, until a signal comes. SetupError, SchemaRefused."""
     upgrade_database(settings.database)
     with _listen(host, port) as listener:
-        run(settings, listener, [], lambda: _say_ready(settings, _url(listener)))
+        run(settings, listener, [], lambda: _say_ready(settings, _url(listener)), dispatch=dispatch)
+
+
+def dispatch(settings: ServerSettings) -> None:
+    """The background alone, until SIGTERM or SIGINT. SchemaRefused."""
+    upgrade_database(settings.database)
+    asyncio.run(_dispatch(settings))
+
+
+async def _dispatch(settings: ServerSettings) -> None:
+    known_methods()  # the log says at once which ones of other packages cannot be used
+    stopping = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, stopping.set)
+    store = open_store(settings)
+    async with Background(store, settings).running():
+        print(json.dumps({"event": "ready", "pid": os.getpid()}), flush=True)
+        await stopping.wait()
+    store.close()
 
 
 def up(settings: ServerSettings, host: str, port: int) -> None:
@@ -77,16 +99,25 @@ def up(settings: ServerSettings, host: str, port: int) -> None:
 
 
 def run(
-    settings: ServerSettings, listener: socket.socket, children: Sequence[Supervised], ready: Callable[[], None]
+    settings: ServerSettings,
+    listener: socket.socket,
+    children: Sequence[Supervised],
+    ready: Callable[[], None],
+    *,
+    dispatch: bool = True,
 ) -> None:
     """Serve until SIGTERM or SIGINT; then stop the API and the children, the last one first."""
-    asyncio.run(_run(settings, listener, children, ready))
+    asyncio.run(_run(settings, listener, children, ready, dispatch))
 
 
 async def _run(
-    settings: ServerSettings, listener: socket.socket, children: Sequence[Supervised], ready: Callable[[], None]
+    settings: ServerSettings,
+    listener: socket.socket,
+    children: Sequence[Supervised],
+    ready: Callable[[], None],
+    dispatch: bool,
 ) -> None:
-    app = create_app(settings)
+    app = create_app(settings, dispatch=dispatch)
     # What was made so far lives as long as the process: looked through by every full collection, it stops all answers
     # for a tenth of a second.
     gc.collect()

@@ -266,8 +266,8 @@ def test_a_server_refuses_a_schema_that_it_does_not_know_with_a_sentence(
     run(tmp_path, "migrate")
     give_revision(f"sqlite:///{tmp_path}/advtex.db", "9901")
     environment = {**os.environ, "ADVTEX_DATA_DIR": str(tmp_path), "ADVTEX_REDIS_URL": "redis://127.0.0.1:1/0"}
-    for command in ("serve", "up"):
-        started = [*COMMAND, command, "--port", "0"]
+    for arguments in (("serve", "--port", "0"), ("up", "--port", "0"), ("dispatch",)):
+        started = [*COMMAND, *arguments]
         ended = subprocess.run(started, env=environment, capture_output=True, text=True, timeout=30)
         assert ended.returncode == 1
         assert ended.stderr.startswith("advtex-server: the database has schema 9901, which this release does not know")

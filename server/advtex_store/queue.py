@@ -34,8 +34,35 @@ DECLINED = "advtex:declined"  # attempts, scored by when they may be offered aga
 DECLINED_SECONDS = 10.0
 PRESENCE = "advtex:worker:"
 BUSY = " busy"
+NEAR = "advtex:near:"  # attempts whose scans a machine has, by its name
+NEAR_SECONDS = 30
+DOWNLOAD = "advtex:download:"  # a scan that a machine downloads ahead, so that no other does
+DOWNLOAD_SECONDS = 600
+PASSED = "advtex:passed:"  # how often an attempt was passed over
+PASSED_SECONDS = 86400
+PASSES = 3  # and no more
 SCANNED = 10_000  # keys that Redis looks at in one go, a few milliseconds; there are some per worker
 PRESENCE_SECONDS = 20  # a worker that has not announced itself for so long is gone
+
+# Puts the first attempt that the machine has the scan of in front of those that it has not.
+_PREFER = """
+local passed = {}
+for _, name in ipairs(redis.call('lrange', KEYS[1], 0, -1)) do
+  if redis.call('sismember', KEYS[2], name) == 1 then
+    for _, other in ipairs(passed) do
+      redis.call('incr', ARGV[1] .. other)
+      redis.call('expire', ARGV[1] .. other, ARGV[3])
+    end
+    redis.call('lrem', KEYS[1], 1, name)
+    redis.call('lpush', KEYS[1], name)
+    return
+  end
+  if tonumber(redis.call('get', ARGV[1] .. name) or 0) >= tonumber(ARGV[2]) then
+    return
+  end
+  passed[#passed + 1] = name
+end
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +193,27 @@ class JobQueue:
         pipeline.zremrangebyscore(DECLINED, "-inf", time.time())
         pipeline.zrange(DECLINED, 0, -1)
         return [_text(name) for name in pipeline.execute()[1]]
+
+    def tell_near(self, host: str, names: Sequence[str]) -> None:
+        """Of what waits, the attempts (`job-attempt`) whose scans the machine has."""
+        pipeline = self.redis.pipeline()
+        pipeline.delete(NEAR + host)
+        if names:
+            pipeline.sadd(NEAR + host, *names)
+            pipeline.expire(NEAR + host, NEAR_SECONDS)
+        pipeline.execute()
+
+    def prefer_near(self, host: str, gib: int) -> None:
+        """Called before an attempt is taken: let the next one be one whose scan the machine has.
+
+        It is delay scheduling (Zaharia et al. 2010): no attempt is passed over more than a few times.
+        """
+        keys = (_key(queue_name(gib)), NEAR + host)
+        self.redis.eval(_PREFER, len(keys), *keys, PASSED, str(PASSES), str(PASSED_SECONDS))
+
+    def download_ahead(self, upload_id: str) -> bool:
+        """Whether the caller may download a scan for an attempt that it does not have; one machine at a time may."""
+        return bool(self.redis.set(DOWNLOAD + upload_id, "", nx=True, ex=DOWNLOAD_SECONDS))
 
     def withdraw(self, keep: set[int]) -> None:
         """Take back what waits for workers of classes that are not in `keep`: nobody listens there any more."""

@@ -246,6 +246,12 @@ class Records(Transitions):
         with self.database.read() as session:
             return next_jobs(session, limit, None if memory_bytes is None else memory_bytes // GIB)
 
+    def uploads_of(self, job_ids: Sequence[str]) -> dict[str, str]:
+        """The uploads of those of the jobs whose scans were sent, not referred to."""
+        with self.database.read() as session:
+            query = select(JobRow.id, JobRow.upload_id).where(JobRow.id.in_(job_ids), JobRow.source.is_(None))
+            return {row.id: row.upload_id for row in session.execute(query)}
+
     def any_preempted(self) -> bool:
         """Whether a job waits that had to give its worker back."""
         with self.database.read() as session:

@@ -111,6 +111,8 @@ class JobWorker(Worker):
     def dequeue_job_and_maintain_ttl(self, timeout: int | None, max_idle_time: int | None = None) -> Any:
         """None, on which RQ ends, once the machine has been idle for as long as it may. It leaves between two waits
         for a job, so that it never takes one with it."""
+        with suppress(RedisError):  # RQ waits for it
+            self._presence.prefer_near(socket.gethostname(), self._gib)
         while True:
             found = super().dequeue_job_and_maintain_ttl(timeout, max_idle_time)
             if found is not None:
@@ -152,7 +154,7 @@ class JobWorker(Worker):
         self._host.stop_signal.install()
         die_with_parent(self._parent_pid, signal.SIGTERM)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)
-        serve_as(self._host)
+        serve_as(replace(self._host, gib=self._gib))
 
     def maintain_heartbeats(self, job: Any) -> None:
         try:

@@ -14,9 +14,10 @@ import structlog
 
 from advtex_store.errors import NotUnderstood, RecordNotFound, StaleAttempt
 from advtex_store.store import open_store
-from advtex_worker.attempt import Attempt, sweep
+from advtex_worker.attempt import Attempt
 from advtex_worker.runner import ENGINE
 from advtex_worker.settings import WorkerSettings
+from advtex_worker.workspace import sweep
 
 log = structlog.get_logger()
 
@@ -44,11 +45,12 @@ class StopSignal:
 
 @dataclass(frozen=True)
 class Host:
-    """What a worker gives to each attempt. `engine` is `module:function` (`events.Request`)."""
+    """What a worker gives to each attempt. `engine` is `module:function` (`events.Request`), `gib` its own class."""
 
     settings: WorkerSettings
     engine: str = ENGINE
     stop_signal: StopSignal = field(default_factory=StopSignal)
+    gib: int | None = None
 
 
 _host: Host | None = None
@@ -78,7 +80,7 @@ def run_attempt(host: Host, job_id: str, attempt: int) -> None:
         store.records.decline(job_id, attempt, str(reason))
         store.queue.decline(job_id, attempt)
     else:
-        carried = Attempt(store, host.settings, host.engine, claim)
+        carried = Attempt(store, host.settings, host.engine, claim, host.gib)
         host.stop_signal.watch(carried)
         try:
             carried.carry()

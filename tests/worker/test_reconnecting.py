@@ -33,3 +33,24 @@ def test_what_listened_to_a_redis_that_is_gone_ends(
     assert listener is not None
     listener.join(10)
     assert not listener.is_alive()
+
+
+@pytest.mark.one_machine("what threads of one process do to each other")
+def test_who_listens_ends_without_a_word_when_its_connection_is_closed(
+    host: Callable[[str], Host], redis_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = host("quick").settings.model_copy(update={"redis_url": redis_url})
+    worker = JobWorker(Host(settings), connect_redis(settings), Departure(Stay(), 1.0), 8)
+
+    def lose(*_: object) -> None:
+        raise redis.exceptions.TimeoutError("silence")
+
+    monkeypatch.setattr(worker, "dequeue_job_and_maintain_ttl", lose)
+    monkeypatch.setattr("rq.Worker.register_death", lose)
+    monkeypatch.setattr(worker, "_install_signal_handlers", lambda: None)
+    with pytest.raises(redis.exceptions.TimeoutError):
+        worker.work(logging_level="WARNING")
+    listener = worker.pubsub_thread
+    assert listener is not None
+    listener.join(10)
+    assert not listener.is_alive()

@@ -61,6 +61,7 @@ class JobWorker(Worker):
         self._parent_pid = os.getpid()
         self._presence = JobQueue(connection)
         self._busy = False
+        self._leaves = False
         self._known_as = f"{socket.gethostname()}-{self._parent_pid}"
         super().__init__(
             [queue_name(gib)],
@@ -91,7 +92,15 @@ class JobWorker(Worker):
                 self.pubsub_thread.stop()
             self.connection.connection_pool.disconnect()  # wakes it
 
+    def _pubsub_exception_handler(self, exc: Exception, pubsub: Any, pubsub_thread: Any) -> None:
+        """RQ's; but a listener whose connection was closed while it read just ends, whatever the read said."""
+        if self._leaves:
+            pubsub_thread.stop()
+        else:
+            super()._pubsub_exception_handler(exc, pubsub, pubsub_thread)  # type: ignore[no-untyped-call]
+
     def register_death(self) -> None:
+        self._leaves = True
         self._presence.depart(self._known_as)
         super().register_death()  # type: ignore[no-untyped-call]
 

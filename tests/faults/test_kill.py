@@ -17,6 +17,7 @@ from advtex_client import Client
 from advtex_contract.jobs import JobState
 from advtex_contract.options import JobOptions
 from advtex_store import keys
+from advtex_store.models import JobRow
 
 STEPS = 120
 
@@ -96,19 +97,29 @@ def test_a_stopped_worker_that_wakes_up_late_commits_nothing(service: LiveServic
 
 
 @pytest.mark.slow
-def test_again_and_again(service: LiveService, scan: Path) -> None:
+def test_again_and_again(service: LiveService, scan: Path, tmp_path: Path) -> None:
+    """However long everything takes: the leases of those who live hold, and those of the killed end when they do."""
+    hurry, steps = tmp_path / "hurry", 9000
+    service.environment |= {"ADVTEX_LEASE_SECONDS": "20", "ADVTEX_ENGINE_HURRY": str(hurry)}
+    records = service.store.records
     with service.client() as client:
-        job_id, tree = begin(service, client, scan, steps=250)
-        for attempt in (2, 3, 4):
-            for pid in tree:
+        job_id = client.submit(scan, JobOptions(steps=steps)).id
+        for attempt in (1, 2, 3):
+            reached = records.job(job_id).reached
+            worker = service.start_worker("leisurely")
+            index = keys.checkpoint_prefix(job_id, attempt) + "index.json"
+            wait_until(lambda: records.job(job_id).reached > reached, 90)  # noqa: B023
+            wait_until(lambda: service.store.blobs.exists(index), 90)  # noqa: B023
+            assert records.job(job_id).attempt == attempt
+            for pid in process_tree(worker.pid):
                 os.kill(pid, signal.SIGKILL)
-            worker = service.start_worker("stepping")
-            began = client.get_job(job_id).progress.step
-            wait_until(lambda: client.get_job(job_id).progress.step >= began + 15)  # noqa: B023
-            wait_until(lambda: client.get_job(job_id).attempt == attempt)  # noqa: B023
-            tree = process_tree(worker.pid)
-        state = assert_done_once(service, client, job_id, steps=250)
+            with service.store.database.write() as session:
+                session.get_one(JobRow, job_id).lease_expires_at = 0.0
+        hurry.touch()
+        service.start_worker("leisurely")
+        state = assert_done_once(service, client, job_id, steps)
         assert len(state["began"]) == 4
+        assert state["began"] == sorted(set(state["began"])), "each attempt went on from a checkpoint of the last"
 
 
 def test_cancel_stops_a_running_job_within_two_seconds_and_retry_goes_on(service: LiveService, scan: Path) -> None:

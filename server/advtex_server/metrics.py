@@ -69,14 +69,17 @@ class FleetCollector(Collector):
         yield troubles
         yield GaugeMetricFamily("advtex_disk_free_bytes", "Room for uploads", self.store.blobs.free_bytes())
         workers = GaugeMetricFamily("advtex_workers", "Living workers by memory for jobs", labels=["gib"])
+        busy = GaugeMetricFamily("advtex_workers_busy", "Of these, those that have a job", labels=["gib"])
         try:
             for found in self.store.queue.classes():
                 workers.add_metric([str(found.gib)], found.workers)
+                busy.add_metric([str(found.gib)], found.workers - found.idle)
         except RedisError:
             up = 0
         else:
             up = 1
             yield workers
+            yield busy
         yield GaugeMetricFamily("advtex_redis_up", "Whether Redis answers", up)
 
     def _so_far(self) -> Iterable[Metric]:

@@ -97,7 +97,7 @@ class JobWorker(Worker):
         if self._leaves:
             pubsub_thread.stop()
         else:
-            super()._pubsub_exception_handler(exc, pubsub, pubsub_thread)  # type: ignore[no-untyped-call]
+            super()._pubsub_exception_handler(exc, pubsub, pubsub_thread)
 
     def register_death(self) -> None:
         self._leaves = True
@@ -241,11 +241,16 @@ def work(host: Host, slot: Slot, departure: Departure) -> None:
         departure.wait(RECONNECT_SECONDS)
 
 
-def main() -> None:
+def argument_parser() -> argparse.ArgumentParser:
+    """Of the command line."""
     parser = argparse.ArgumentParser(prog="advtex-worker", description=__doc__)
     parser.add_argument("--version", action="version", version=f"advtex-worker {product_version()}")
     add_arguments(parser)
-    stay = read_stay(parser.parse_args())
+    return parser
+
+
+def main() -> None:
+    stay = read_stay(argument_parser().parse_args())
     try:
         settings = WorkerSettings()
     except ValidationError as error:

@@ -34,9 +34,11 @@ class Background:
         """Work for as long as the block lasts."""
         tasks = [asyncio.create_task(self._dispatcher.run()), asyncio.create_task(self._deliverer.run())]
         self._checker.start()
-        yield
-        for task in tasks:
-            task.cancel()
-            with suppress(asyncio.CancelledError):
-                await task
-        await asyncio.to_thread(self._checker.stop)
+        try:
+            yield
+        finally:
+            for task in tasks:
+                task.cancel()
+                with suppress(asyncio.CancelledError):
+                    await task
+            await asyncio.to_thread(self._checker.stop)

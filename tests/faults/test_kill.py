@@ -33,6 +33,13 @@ def begin(service: LiveService, client: Client, scan: Path, steps: int = STEPS) 
     return job.id, tree
 
 
+def kill_all(tree: list[int]) -> None:
+    """At once; some are gone with their parent before it is their turn."""
+    for pid in tree:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+
+
 def test_the_runner_alone(service: LiveService, scan: Path) -> None:
     with service.client() as client:
         job_id, (_, _, runner) = begin(service, client, scan)
@@ -66,8 +73,7 @@ def test_the_worker_alone_takes_its_horse_and_runner_with_it(service: LiveServic
 def test_the_whole_tree(service: LiveService, scan: Path) -> None:
     with service.client() as client:
         job_id, tree = begin(service, client, scan)
-        for pid in tree:
-            os.kill(pid, signal.SIGKILL)
+        kill_all(tree)
         service.start_worker("stepping")
         state = assert_done_once(service, client, job_id, STEPS)
         assert state["began"][1] >= 10
@@ -111,8 +117,7 @@ def test_again_and_again(service: LiveService, scan: Path, tmp_path: Path) -> No
             wait_until(lambda: records.job(job_id).reached > reached, 90)  # noqa: B023
             wait_until(lambda: service.store.blobs.exists(index), 90)  # noqa: B023
             assert records.job(job_id).attempt == attempt
-            for pid in process_tree(worker.pid):
-                os.kill(pid, signal.SIGKILL)
+            kill_all(process_tree(worker.pid))
             with service.store.database.write() as session:
                 session.get_one(JobRow, job_id).lease_expires_at = 0.0
         hurry.touch()

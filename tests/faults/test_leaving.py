@@ -7,6 +7,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import httpx
@@ -34,7 +35,8 @@ def service(service: LiveService) -> LiveService:
 def to_all(worker: subprocess.Popen[bytes]) -> None:
     """As SLURM signals a step: every process of it, runner and all."""
     for pid in process_tree(worker.pid):
-        os.kill(pid, signal.SIGUSR1)
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGUSR1)
 
 
 def test_a_job_in_hand_is_given_back_and_goes_on_elsewhere(service: LiveService, scan: Path, tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ STEPS = 9000
 # Signals every process of its step once there is a file, as `srun` does at the time of `--signal`.
 SRUN = f"""#!{sys.executable}
 import os, signal, subprocess, sys, time
+from contextlib import suppress
 from pathlib import Path
 from live_service import process_tree
 step, notice = subprocess.Popen(sys.argv[1:]), Path(os.environ["NOTICE"])
@@ -28,7 +29,8 @@ while step.poll() is None:
     if notice.exists():
         notice.unlink()
         for pid in process_tree(step.pid):
-            os.kill(pid, signal.SIGUSR1)
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGUSR1)
     time.sleep(0.05)
 sys.exit(step.returncode)
 """

@@ -14,6 +14,18 @@ from advtex_worker.main import JobWorker
 from advtex_worker.tasks import Host
 
 
+def assert_its_listener_ends(worker: JobWorker, lose: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
+    """When `lose` is what becomes of its first wait for a job."""
+    monkeypatch.setattr(worker, "dequeue_job_and_maintain_ttl", lose)
+    monkeypatch.setattr(worker, "_install_signal_handlers", lambda: None)
+    with pytest.raises(redis.exceptions.RedisError):
+        worker.work(logging_level="WARNING")
+    listener = worker.pubsub_thread
+    assert listener is not None
+    listener.join(10)
+    assert not listener.is_alive()
+
+
 def test_what_listened_to_a_redis_that_is_gone_ends(
     host: Callable[[str], Host], own_redis: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -25,14 +37,7 @@ def test_what_listened_to_a_redis_that_is_gone_ends(
         own_redis.stop()
         raise redis.exceptions.TimeoutError("silence")
 
-    monkeypatch.setattr(worker, "dequeue_job_and_maintain_ttl", lose)
-    monkeypatch.setattr(worker, "_install_signal_handlers", lambda: None)
-    with pytest.raises(redis.exceptions.RedisError):
-        worker.work(logging_level="WARNING")
-    listener = worker.pubsub_thread
-    assert listener is not None
-    listener.join(10)
-    assert not listener.is_alive()
+    assert_its_listener_ends(worker, lose, monkeypatch)
 
 
 @pytest.mark.one_machine("what threads of one process do to each other")
@@ -45,12 +50,5 @@ def test_who_listens_ends_without_a_word_when_its_connection_is_closed(
     def lose(*_: object) -> None:
         raise redis.exceptions.TimeoutError("silence")
 
-    monkeypatch.setattr(worker, "dequeue_job_and_maintain_ttl", lose)
     monkeypatch.setattr("rq.Worker.register_death", lose)
-    monkeypatch.setattr(worker, "_install_signal_handlers", lambda: None)
-    with pytest.raises(redis.exceptions.TimeoutError):
-        worker.work(logging_level="WARNING")
-    listener = worker.pubsub_thread
-    assert listener is not None
-    listener.join(10)
-    assert not listener.is_alive()
+    assert_its_listener_ends(worker, lose, monkeypatch)

@@ -108,13 +108,15 @@ def test_a_job_whose_scan_was_downloaded_ahead_is_nobodys(
     place = Place(
         tmp_path / "data", postgres_url, s3_url, {k: v for k, v in os.environ.items() if k.startswith("AWS_")}
     )
-    patient = {"ADVTEX_LEASE_SECONDS": "60"}
-    with fleet(tmp_path, place, workers=1, engine="stepping", variables=patient) as running:
+    hurry = tmp_path / "hurry"
+    patient = {"ADVTEX_LEASE_SECONDS": "60", "ADVTEX_ENGINE_HURRY": str(hurry)}
+    with fleet(tmp_path, place, workers=1, engine="leisurely", variables=patient) as running:
         records, key = running.store.records, running.store.accounts.create_key("fleet", owner="fleet")
         data = write_zip(tmp_path / "scan.zip", scan).read_bytes()
         with httpx.Client(base_url=running.urls[0], headers={"Authorization": f"Bearer {key}"}, timeout=30) as http:
             uploads = [http.post("/v1/uploads", content=data).json()["id"] for _ in range(2)]
-            bodies = [{"upload_id": upload, "options": {"steps": 1000}} for upload in uploads]
+            options = [{"steps": 4000}, {"steps": 10}]
+            bodies = [{"upload_id": upload, "options": given} for upload, given in zip(uploads, options, strict=True)]
             first, second = (str(http.post("/v1/jobs", json=body).json()["id"]) for body in bodies)
         cached = [place.data / "scans" / f"{upload}.zip" for upload in uploads]
         wait_until(lambda: all(path.exists() for path in cached), 60)
@@ -122,6 +124,7 @@ def test_a_job_whose_scan_was_downloaded_ahead_is_nobodys(
         assert (row.state, row.attempt, row.worker) == (JobState.queued, 1, None)
         running.workers[0].terminate()
         assert running.workers[0].wait(60) == 0
+        hurry.touch()
         running.workers[0] = running.start_worker(0)
         wait_until(lambda: records.count_by_state().get("succeeded") == 2, 90)
         assert (records.job(first).attempt, records.job(second).attempt) == (2, 1)

@@ -161,24 +161,34 @@ def test_a_machine_is_busy_while_one_of_its_workers_is(redis_url: str) -> None:
         assert queue.any_busy("this")
 
 
-ENDING = "import os, sys; open(sys.argv[1], 'a').write('x'); sys.exit(int(os.environ['ADVTEX_GPU'][-1]))"
+# Notes that it has begun, tells the worker to go once five have, and ends with a code that is its GPU's number.
+ENDING = """
+import os, sys
+begun, going = sys.argv[1:]
+with open(begun, "a") as file:
+    file.write("x")
+if os.path.getsize(begun) >= 5:
+    open(going, "w").close()
+sys.exit(int(os.environ["ADVTEX_GPU"][-1]))
+"""
 
 
 def test_slots_that_have_left_are_not_begun_again_and_those_that_died_are(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("advtex_store.supervision.RESTART_SECONDS", (0.01,))
+    monkeypatch.setattr(leaving, "NOTICE_SECONDS", 0.0)
     monkeypatch.setattr(signal, "signal", lambda *_: None)
-    begun, settings = tmp_path / "begun", WorkerSettings(data_dir=tmp_path)
-    command = [sys.executable, "-c", ENDING, str(begun)]
+    begun, going, settings = tmp_path / "begun", tmp_path / "going", WorkerSettings(data_dir=tmp_path)
+    command = [sys.executable, "-c", ENDING, str(begun), str(going)]
     departure = Departure(Stay(max_jobs=1), 1.0)
     supervise(command, [Slot("GPU-0", 1), Slot("GPU-0", 1)], settings, departure)
     assert begun.read_text() == "xx"
     assert departure.exit_code == 0
-    limited = Departure(Stay(max_jobs=1, until=time.time() + 3), 1.0)
-    supervise(command, [Slot("GPU-0", 1), Slot("GPU-1", 1)], settings, limited)
+    noticed = Departure(Stay(max_jobs=1, notice=str(going)), 1.0)
+    supervise(command, [Slot("GPU-0", 1), Slot("GPU-1", 1)], settings, noticed)
     assert len(begun.read_text()) >= 5, "the one that dies goes on being started"
-    assert limited.exit_code == AGAIN
+    assert noticed.exit_code == AGAIN
 
 
 def test_a_worker_whose_time_is_up_takes_nothing(tmp_path: Path) -> None:

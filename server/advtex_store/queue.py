@@ -136,19 +136,19 @@ class JobQueue:
         names = sorted(_text(key).removeprefix(PRESENCE) for key in found)
         return [name for name in names if not host or name.rpartition("-")[0] == host]
 
-    def any_busy(self, host: str) -> bool:
-        """Whether a worker of the host has a job."""
-        return any(told.endswith(BUSY) for told in self._announced(host))
+    def busy_workers(self, host: str) -> list[str]:
+        """Names of the host's workers that have a job."""
+        return [name for name, told in self._announced(host).items() if told.endswith(BUSY)]
 
-    def _announced(self, host: str = "") -> list[str]:
-        """What the living workers tell."""
+    def _announced(self, host: str = "") -> dict[str, str]:
+        """What the living workers tell, by their names."""
         names = self.workers(host)
         told = self.redis.mget([PRESENCE + name for name in names]) if names else []
-        return [_text(value) for value in told if value is not None]
+        return {name: _text(value) for name, value in zip(names, told, strict=True) if value is not None}
 
     def classes(self) -> list[WorkerClass]:
         """The classes of which workers live, smallest first."""
-        known = self._announced()
+        known = self._announced().values()
         count = Counter(int(value.removesuffix(BUSY)) for value in known)
         idle = Counter(int(value) for value in known if not value.endswith(BUSY))
         return [WorkerClass(gib, workers, idle[gib]) for gib, workers in sorted(count.items())]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -14,14 +16,15 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
-from redis import Redis
 from rq.exceptions import StopRequested
 
-from advtex_store.queue import JobQueue
+from advtex_store.queue import JobQueue, connect_redis
 from advtex_worker import leaving
-from advtex_worker.leaving import AGAIN, Departure, Notice, Reason, Stay, add_arguments, read_stay
+from advtex_worker.leaving import AGAIN, Departure, Notice, Reason, Stay, add_arguments, parent_of, read_stay
+from advtex_worker.main import JobWorker
 from advtex_worker.settings import WorkerSettings
 from advtex_worker.slots import Slot, supervise
+from advtex_worker.tasks import Host
 
 
 def stay(*arguments: str) -> Stay:
@@ -151,14 +154,21 @@ def test_a_file_is_a_notice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert departure.exit_code == AGAIN
 
 
-def test_a_machine_is_busy_while_one_of_its_workers_is(redis_url: str) -> None:
-    with Redis.from_url(redis_url) as connection:
-        queue = JobQueue(connection)
-        queue.announce("this-1", 8)
-        queue.announce("that-1", 8, busy=True)
-        assert not queue.any_busy("this")
-        queue.announce("this-2", 24, busy=True)
-        assert queue.any_busy("this")
+def test_slots_of_one_worker_are_idle_together(redis_url: str, tmp_path: Path) -> None:
+    """Those of others are not waited for: another task of SLURM may have its job on the same machine for hours."""
+    settings = WorkerSettings(data_dir=tmp_path, redis_url=redis_url)
+    worker = JobWorker(Host(settings), connect_redis(settings), Departure(Stay(), 1.0), 8)
+    queue, host, mine = JobQueue(worker.connection), socket.gethostname(), os.getpid()
+    with subprocess.Popen(["sleep", "60"]) as others:
+        queue.announce(f"{host}-{others.pid}", 8, busy=True)
+        queue.announce(f"elsewhere-{mine}", 8, busy=True)
+        queue.announce(f"{host}-{mine}", 8)
+        assert not worker._is_sibling_busy()
+        queue.announce(f"{host}-{mine}", 24, busy=True)
+        assert worker._is_sibling_busy()
+        others.kill()
+    assert parent_of(others.pid) is None
+    worker.connection.close()
 
 
 # Notes that it has begun, tells the worker to go once five have, and ends with a code that is its GPU's number.

@@ -32,7 +32,7 @@ class Reason(Enum):
     """Why a worker goes, and the exit code that says so."""
 
     asked = "it was asked to", 0
-    idle = "its machine has been idle for long enough", 0
+    idle = "it has been idle for long enough", 0
     jobs = "it has had its jobs", 0
     evicted = "SIGUSR1: its machine is wanted", AGAIN
     limit = "its time is up", AGAIN
@@ -47,8 +47,8 @@ class Reason(Enum):
 class Stay:
     """How long a worker stays, unless it is asked to go.
 
-    max_jobs: attempts that each of its slots takes. idle_seconds: of its whole machine. until: seconds since 1970, by
-    when it is gone. notice: a file that comes to be, or a URL, for both of which see `Notice`.
+    max_jobs: attempts that each of its slots takes. idle_seconds: of all its slots at once. until: seconds since 1970,
+    by when it is gone. notice: a file that comes to be, or a URL, for both of which see `Notice`.
     """
 
     max_jobs: int | None = None
@@ -77,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("how long it stays", "A job that still runs is given back with a checkpoint.")
     group.add_argument("--max-jobs", type=_positive, metavar="N", help="attempts that each slot takes before it ends")
     group.add_argument(
-        "--exit-when-idle", type=_positive, metavar="SECONDS", help="end when no slot of the machine had a job so long"
+        "--exit-when-idle", type=_positive, metavar="SECONDS", help="end when none of its slots had a job for so long"
     )
     group.add_argument(
         "--until", type=_time, metavar="TIME", help="be gone by then: seconds since 1970, or as 2026-01-31T18:00"
@@ -184,6 +184,15 @@ class Departure:
         if self.is_due():
             raise StopRequested
         time.sleep(seconds)
+
+
+def parent_of(pid: int) -> int | None:
+    """The process that has started another one; None where nothing tells (it has ended, or this is no Linux)."""
+    try:
+        told = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return None
+    return int(told.rpartition(")")[2].split()[1])
 
 
 def _positive(text: str) -> int:

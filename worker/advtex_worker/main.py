@@ -33,7 +33,7 @@ from advtex_store.logs import configure_logs
 from advtex_store.process_ends import die_with_parent
 from advtex_store.queue import JobQueue, attempt_of, class_of, connect_redis, queue_name
 from advtex_store.secrecy import hide_environment
-from advtex_worker.leaving import STOP_SIGNALS, Departure, Reason, Stay, add_arguments, read_stay
+from advtex_worker.leaving import STOP_SIGNALS, Departure, Reason, Stay, add_arguments, parent_of, read_stay
 from advtex_worker.settings import WorkerSettings
 from advtex_worker.slots import Slot, find_slots, hold, settings_of, supervise
 from advtex_worker.tasks import Host, serve_as
@@ -118,7 +118,7 @@ class JobWorker(Worker):
             raise StopRequested
 
     def dequeue_job_and_maintain_ttl(self, timeout: int | None, max_idle_time: int | None = None) -> Any:
-        """None, on which RQ ends, once the machine has been idle for as long as it may. It leaves between two waits
+        """None, on which RQ ends, once all slots have been idle for as long as they may. It leaves between two waits
         for a job, so that it never takes one with it."""
         with suppress(RedisError):  # RQ waits for it
             self._presence.prefer_near(socket.gethostname(), self._gib)
@@ -126,9 +126,15 @@ class JobWorker(Worker):
             found = super().dequeue_job_and_maintain_ttl(timeout, max_idle_time)
             if found is not None:
                 return found
-            if not self._presence.any_busy(socket.gethostname()):
+            if not self._is_sibling_busy():
                 self._departure.begin(Reason.idle)
                 return None
+
+    def _is_sibling_busy(self) -> bool:
+        """Whether a worker of the same parent has a job: another slot, or another task of a batch system's step. They
+        hold the machine together, so they leave it together."""
+        names = self._presence.busy_workers(socket.gethostname())
+        return any(parent_of(int(name.rpartition("-")[2])) == os.getppid() for name in names)
 
     def execute_job(self, job: Any, queue: Any) -> None:
         """The work-horse inherits the context: its lines and RQ's own name the job in both processes."""

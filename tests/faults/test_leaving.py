@@ -39,6 +39,7 @@ def to_all(worker: subprocess.Popen[bytes]) -> None:
             os.kill(pid, signal.SIGUSR1)
 
 
+@pytest.mark.slow
 def test_a_job_in_hand_is_given_back_and_goes_on_elsewhere(service: LiveService, scan: Path, tmp_path: Path) -> None:
     going, hurry = tmp_path / "going", tmp_path / "hurry"
     service.environment |= {"ADVTEX_GRACE_SECONDS": str(GRACE_SECONDS), "ADVTEX_ENGINE_HURRY": str(hurry)}
@@ -89,7 +90,7 @@ def test_a_worker_has_its_jobs_and_leaves_the_others(service: LiveService, scan:
 def test_no_job_goes_with_workers_that_come_and_go_all_the_time(service: LiveService, scan: Path) -> None:
     """Workers that leave after a job or a second's idleness, until a batch is done."""
     with service.client() as client:
-        jobs = [client.submit(scan, JobOptions(steps=10, seed=seed)).id for seed in range(12)]
+        jobs = [client.submit(scan, JobOptions(steps=10, seed=seed)).id for seed in range(6)]
         done = lambda: all(client.get_job(job).state == JobState.succeeded for job in jobs)  # noqa: E731
         deadline = time.monotonic() + 240
         while not done() and time.monotonic() < deadline:
@@ -115,7 +116,7 @@ def test_a_job_whose_scan_was_downloaded_ahead_is_nobodys(
         data = write_zip(tmp_path / "scan.zip", scan).read_bytes()
         with httpx.Client(base_url=running.urls[0], headers={"Authorization": f"Bearer {key}"}, timeout=30) as http:
             uploads = [http.post("/v1/uploads", content=data).json()["id"] for _ in range(2)]
-            options = [{"steps": 4000}, {"steps": 10}]
+            options = [{"steps": 2500}, {"steps": 10}]
             bodies = [{"upload_id": upload, "options": given} for upload, given in zip(uploads, options, strict=True)]
             first, second = (str(http.post("/v1/jobs", json=body).json()["id"]) for body in bodies)
         cached = [place.data / "scans" / f"{upload}.zip" for upload in uploads]

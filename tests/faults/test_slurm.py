@@ -68,6 +68,7 @@ def start_task(service: LiveService) -> subprocess.Popen[bytes]:
     return service._start(["bash", str(SCRIPT)])
 
 
+@pytest.mark.slow
 def test_a_task_whose_time_is_up_gives_its_job_back_and_is_queued_again(
     service: LiveService, scan: Path, tmp_path: Path
 ) -> None:

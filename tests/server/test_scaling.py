@@ -161,6 +161,7 @@ def every_third_is_slow(number: int) -> float:
     return 900.0 if number % 3 == 2 else 30.0
 
 
+@pytest.mark.slow
 def test_five_hundred_jobs_bring_up_what_they_need_and_nothing_stays(live: Any) -> None:
     small, large = scaled_jobs()
     classes = [

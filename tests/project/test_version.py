@@ -56,6 +56,15 @@ def test_the_images_are_tagged_with_it() -> None:
     assert kustomization["images"] == [{"name": f"advtex-{name}", "newTag": VERSION} for name in sorted(names)]
 
 
+def test_pages_name_images_by_it() -> None:
+    named = {
+        tag
+        for page in (ROOT / "README.md", *ROOT.glob("*/README.md"))
+        for tag in re.findall(r"advtex-(?:server|worker):([\w.]+)", page.read_text(encoding="utf-8"))
+    }
+    assert named == {VERSION}
+
+
 def test_the_citation_names_it() -> None:
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))["version"] == VERSION
 

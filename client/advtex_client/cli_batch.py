@@ -22,7 +22,16 @@ from advtex_client._cli import (
     retention,
 )
 from advtex_client._display import Display, batch_line, batch_table, finding_lines
-from advtex_client.batches import BatchRun, remember, remembered, result_rows, submit_batch, waiting_reasons
+from advtex_client.batch_report import write_report
+from advtex_client.batches import (
+    BatchRun,
+    remember,
+    remembered,
+    report_rows,
+    result_rows,
+    submit_batch,
+    waiting_reasons,
+)
 from advtex_client.client import Client
 from advtex_client.errors import ClientError, JobFailedError, ScanRejectedError, WaitTimeoutError
 from advtex_client.manifests import read_items
@@ -106,6 +115,31 @@ def status(
             _show_table(client, display, view)
         else:
             display.data(view, batch_line(view, () if display.as_json else waiting_reasons(client, view)))
+
+
+@app.command()
+def report(
+    batch: BatchName,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="the page, .html; else BATCH.html")] = None,
+    url: Url = None,
+    api_key: ApiKey = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write a page that shows what a batch came to: scores, pictures, times, GPU seconds, and why jobs failed.
+
+    The page needs no other file; the same as .csv and .json is written beside it.
+    """
+    with command(as_json) as display, Client(url, api_key) as client:
+        view = client.get_batch(batch)
+        rows, thumbnails = list[dict[str, Any]](), dict[str, bytes]()
+        with display.count_bar(f"batch {batch}", view.jobs) as advance:
+            for row, thumbnail in report_rows(client, batch):
+                advance()
+                rows.append(row)
+                if thumbnail is not None:
+                    thumbnails[row["job"]] = thumbnail
+        written = [str(path) for path in write_report(output or Path(f"{batch}.html"), view, rows, thumbnails)]
+        display.data({"files": written}, "\n".join(written))
 
 
 @app.command()

@@ -17,7 +17,7 @@ from advtex_client._display import batch_line, duration
 from advtex_client.errors import ClientError
 from advtex_contract.jobs import BatchView
 
-COLUMNS = ("label", "job", "state", "attempt", "steps", "gpu_seconds", "elapsed_seconds", "reason")
+COLUMNS = ("label", "job", "state", "attempt", "steps", "gpu_seconds", "elapsed_seconds", "late", "reason")
 FORMULA = ("=", "+", "-", "@", "\t", "\r")  # how cells begin that spreadsheets would compute
 NOTE = (
     "GPU seconds are what the stages of all attempts took on their workers; work that was lost with a worker is not in "
@@ -104,6 +104,8 @@ def _line(row: Row, scores: Sequence[str], thumbnail: bytes | None) -> str:
 
 
 def _cell(name: str, value: Any) -> str:
+    if isinstance(value, bool):
+        value = "late" if value else ""
     if isinstance(value, (int, float)):
         shown = duration(value) if name.endswith("_seconds") else f"{value:.4g}" if isinstance(value, float) else value
         return f'<td class="number" data-value="{value}">{shown}</td>'

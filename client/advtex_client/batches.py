@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import datetime
 from itertools import islice
 from math import isfinite
 from pathlib import Path
@@ -55,6 +56,7 @@ class BatchRun(BaseModel):
     options: JobOptions
     priority: int
     retention_seconds: int | None = None
+    deadline: datetime | None = None
 
 
 def remember(server: str, batch_id: str, run: BatchRun, folder: Path | None = None) -> None:
@@ -110,17 +112,26 @@ def waiting_reasons(client: Client, batch: BatchView) -> list[str]:
     return [reason for reason, _ in found.most_common()]
 
 
-def report_rows(client: Client, batch_id: str) -> Iterator[tuple[dict[str, Any], bytes | None]]:
-    """Yield a batch's jobs, sorted by label, for a report: all that tells how each went, and its thumbnail (JPEG)."""
+def report_rows(client: Client, batch_id: str, thumbnails: dict[str, bytes] | None = None) -> Iterator[dict[str, Any]]:
+    """Yield a batch's jobs, sorted by label, with all that tells how each went. Put their pictures (JPEG), by the job's
+    id, into `thumbnails`."""
     jobs = sorted(client.list_jobs(batch=batch_id), key=lambda job: (job.label, job.id))
+
+    def row(job: JobView) -> dict[str, Any]:
+        if thumbnails is not None and (picture := _result(client, job, THUMBNAIL)) is not None:
+            thumbnails[job.id] = picture
+        return _report_row(client, job)
+
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        yield from pool.map(lambda job: (_report_row(client, job), _result(client, job, THUMBNAIL)), jobs)
+        yield from pool.map(row, jobs)
 
 
 def _report_row(client: Client, job: JobView) -> dict[str, Any]:
     stages = job.progress.stage_seconds
     row: dict[str, Any] = {"label": job.label, "job": job.id, "state": job.state, "attempt": job.attempt}
     row |= {"steps": job.progress.steps, "gpu_seconds": round(sum(stages.values()), 1), "stage_seconds": stages}
+    if job.deadline is not None:
+        row |= {"deadline": job.deadline.isoformat(), "late": job.late}
     if job.finished_at is not None:
         row["elapsed_seconds"] = round((job.finished_at - job.created_at).total_seconds(), 1)
     if job.error is not None:
@@ -180,7 +191,7 @@ def _submit(client: Client, batch_id: str, item: BatchItem) -> JobView:
 
 
 def _spec(batch_id: str, item: BatchItem) -> JobSpec:
-    return job_spec(item.options, item.label, batch_id, item.priority, retention_seconds=item.retention_seconds)
+    return job_spec(item.options, item.label, batch_id, item.priority, item.retention_seconds, item.deadline)
 
 
 def _path(server: str, batch_id: str, folder: Path | None) -> Path:

@@ -17,6 +17,7 @@ from fake_server import NOW, FakeServer, ok, view
 from typer.testing import CliRunner, Result
 
 from advtex_client import cli, cli_batch
+from advtex_client.batch_comparison import compared
 from advtex_client.client import Client
 from advtex_contract.errors import ErrorDetail
 from advtex_contract.jobs import BatchView, JobError, JobPage, JobState, JobView, Progress
@@ -161,3 +162,43 @@ def test_where_a_report_cannot_go_is_said(connect: Connect, tmp_path: Path) -> N
     (tmp_path / "file").touch()
     assert run("report", "night", "-o", tmp_path / "file" / "r.html").exit_code == 2
     assert run("report", "none").exit_code == 2
+
+
+def test_two_batches_are_compared_by_label(connect: Connect) -> None:
+    spent = {"progress": Progress(stage_seconds={"x": 60.0})}
+    first = [view(f"a{n}", JobState.succeeded, label=label, **spent) for n, label in ((0, "hall"), (1, "bath"))]
+    first.append(view("a2", JobState.failed, label="attic", **spent))
+    less = {"progress": Progress(stage_seconds={"x": 45.0})}
+    second = [view(f"b{n}", JobState.succeeded, label=label, **less) for n, label in ((1, "hall"), (10, "bath"))]
+    connect({"night1": first, "night2": second})
+    ran = run("compare", "night1", "night2", "--json")
+    found = json.loads(ran.stdout)
+    assert ran.exit_code == 5, "a job of the first failed"
+    scans = {scan["label"]: scan for scan in found["scans"]}
+    assert scans["hall"]["scores"] == {"lpips": -0.25}
+    assert scans["bath"]["scores"] == {"lpips": 0.25}
+    assert scans["attic"] == {
+        "label": "attic",
+        "states": ["failed", None],
+        "gpu_seconds": [60.0, None],
+        "gpu_seconds_difference": None,
+        "scores": {},
+    }
+    assert found["scores"] == {"lpips": {"mean": 0.0, "scans": 2, "worst": 0.25, "label": "bath"}}
+    assert found["gpu_seconds"] == {"mean": -15.0, "scans": 2, "worst": -15.0, "label": "bath"}
+    lines = run("compare", "night1", "night2").stdout.splitlines()
+    assert lines[1].split() == ["attic", "failed", "->", "none", "1", "min", "0", "s", "->"]
+    assert lines[-2] == "lpips: mean +0 over 2 scans, worst +0.25 (bath)"
+    connect({"night1": first[:2], "night2": second})
+    assert run("compare", "night1", "night2").exit_code == 0
+    assert run("compare", "night1", "none").exit_code == 2
+
+
+def test_the_worst_of_a_score_is_where_it_became_worse() -> None:
+    low = {"psnr": 20.0, "s3_ratio": 0.9}
+    first = [{"label": n, "job": n, "state": "x", "scores": low} for n in "ab"]
+    scores = {"a": {"psnr": 25.0, "s3_ratio": 1.0}, "b": {"psnr": 19.0, "s3_ratio": 0.5}}
+    second = [{"label": n, "job": n, "state": "x", "scores": scores[n]} for n in "ab"]
+    found = compared(first, second)["scores"]
+    assert (found["psnr"]["label"], found["psnr"]["worst"], found["psnr"]["mean"]) == ("b", -1.0, 2.0)
+    assert (found["s3_ratio"]["label"], found["s3_ratio"]["worst"]) == ("b", pytest.approx(-0.4))

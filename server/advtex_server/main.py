@@ -51,6 +51,9 @@ Port = Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one")]
 MaxActiveJobs = Annotated[
     int | None, typer.Option(min=0, max=2**31 - 1, help="jobs of its owner that have not ended, at most")
 ]
+MaxRunningJobs = Annotated[
+    int | None, typer.Option(min=1, max=2**31 - 1, help="jobs of its owner that run at a time, at most")
+]
 MaxBytes = Annotated[int | None, typer.Option(min=0, max=2**63 - 1, help="bytes of its owner's uploads, at most")]
 
 
@@ -129,6 +132,7 @@ def create_key(
     days: Annotated[int | None, typer.Option(min=1, help="until the key expires")] = None,
     max_active_jobs: MaxActiveJobs = None,
     max_bytes: MaxBytes = None,
+    max_running_jobs: MaxRunningJobs = None,
 ) -> None:
     """Make a key and print it: it cannot be shown again."""
     expires = None if days is None else (datetime.now(UTC) + timedelta(days=days)).timestamp()
@@ -140,6 +144,7 @@ def create_key(
             expires_at=expires,
             max_active_jobs=max_active_jobs,
             max_bytes=max_bytes,
+            max_running_jobs=max_running_jobs,
         )
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
@@ -163,6 +168,7 @@ def list_keys() -> None:
                     "max_active_jobs": row.max_active_jobs,
                     "bytes": usage.bytes,
                     "max_bytes": row.max_bytes,
+                    "max_running_jobs": row.max_running_jobs,
                     "created_at": row.created_at,
                     "expires_at": row.expires_at,
                     "revoked_at": row.revoked_at,
@@ -189,10 +195,15 @@ def rotate_key(
 
 
 @keys.command("limit")
-def limit_key(key_id: str, max_active_jobs: MaxActiveJobs = None, max_bytes: MaxBytes = None) -> None:
-    """Set both limits of a key; what is left out is not limited."""
+def limit_key(
+    key_id: str,
+    max_active_jobs: MaxActiveJobs = None,
+    max_bytes: MaxBytes = None,
+    max_running_jobs: MaxRunningJobs = None,
+) -> None:
+    """Set all limits of a key; what is left out is not limited."""
     with _told(RecordNotFound):
-        _accounts().set_quota(key_id, max_active_jobs, max_bytes)
+        _accounts().set_quota(key_id, max_active_jobs, max_bytes, max_running_jobs)
 
 
 def main() -> None:

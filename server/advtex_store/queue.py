@@ -228,9 +228,17 @@ class JobQueue:
         """Of what waits for a class, the last `count`. -> what came back: a worker may have just taken some."""
         return self._remove(queue_name(gib), -count)
 
+    def take_away(self, gib: int, names: Sequence[str]) -> list[str]:
+        """Of what waits for a class, these. -> what came back."""
+        return self._take(_key(queue_name(gib)), names)
+
     def _remove(self, queue: str, first: int) -> list[str]:
-        removed, key = [], _key(queue)
-        for name in map(_text, self.redis.lrange(key, first, -1)):
+        key = _key(queue)
+        return self._take(key, [_text(raw) for raw in self.redis.lrange(key, first, -1)])
+
+    def _take(self, key: str, names: Sequence[str]) -> list[str]:
+        removed = []
+        for name in names:
             if self.redis.lrem(key, 1, name):  # else a worker has just come and taken it
                 removed.append(name)
                 with suppress(NoSuchJobError):

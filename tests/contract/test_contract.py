@@ -130,3 +130,12 @@ def test_the_contract_is_light() -> None:
         "print([m for m in ('httpx', 'redis', 'numpy', 'torch', 'fastapi', 'sqlalchemy') if m in sys.modules])"
     )
     assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+def test_a_deadline_that_is_not_given_is_not_written() -> None:
+    """A server from before deadlines refuses a name that it does not know; the rest is written as it always was."""
+    spec = JobSpec(upload_id="u")
+    assert "deadline" not in spec.model_dump(mode="json")
+    assert '"source":null' in spec.model_dump_json()
+    due = JobSpec(upload_id="u", deadline=datetime(2026, 1, 31, 8, tzinfo=UTC))
+    assert JobSpec.model_validate_json(due.model_dump_json()) == due

@@ -51,7 +51,7 @@ def resume_batch(batch_id: BatchId, caller: Writer, service: TheService) -> Batc
     return service.batches.pause(caller.owner, batch_id, False)
 
 
-@router.put("/{batch_id}/limits", status_code=204, responses=refuses(422))
+@router.put("/{batch_id}/limits", status_code=204, responses=refuses(ErrorCode.bad_request, 422))
 def limit_batch(batch_id: BatchId, limits: BatchLimits, caller: Writer, service: TheService) -> Response:
     """Say how many of its jobs run at a time, also before the first one is made."""
     service.batches.limit(caller.owner, batch_id, limits)

@@ -19,6 +19,13 @@ from advtex_options.methods import METHOD_HELP
 from advtex_options.words import PRESET_HELP, Preset
 from advtex_scan.layouts import LAYOUT_NAMES
 
+UNSEEN_HELP = MappingProxyType(
+    {
+        "guess": "it has the tone of its surroundings",
+        "gray": "it is gray",
+        "remove": "its faces are left out of the model",
+    }
+)
 FACE_BUDGET = 80_000
 MAX_VIEWS = 240
 
@@ -126,6 +133,13 @@ class Options:
         "images inside of models as PNG: exact, and four times as large",
         "Lossless images",
         unset="no, they are JPEG in all but the OBJ",
+    )
+    unseen: str | None = option(
+        None,
+        "what becomes of the surface that no photograph shows, nor one beside it",
+        "Never seen",
+        unset="guess",
+        choices=UNSEEN_HELP,
     )
 
 

@@ -16,12 +16,12 @@ from advtex_engine.atlas import ChartMaker, MeshPreparation, begin_charts, chart
 from advtex_engine.budget import Budget
 from advtex_engine.conventions import checked_conventions
 from advtex_engine.core import Diverged, Monitor, TextureConfig, WarningKeeper
+from advtex_engine.coverage import complete_texture
 from advtex_engine.ingest import FrameStore, read_capture
-from advtex_engine.mesh import MAX_FRAMES, fuse, register_mesh
+from advtex_engine.mesh import MAX_FRAMES, fuse, keep_faces, register_mesh
 from advtex_engine.methods import require, texture_function
 from advtex_engine.metrics.speckle import speckle_share
 from advtex_engine.previews.curves import curves
-from advtex_engine.render import fill_holes
 from advtex_engine.results import (
     assembled,
     describe_scene,
@@ -30,6 +30,7 @@ from advtex_engine.results import (
     write_gallery,
     write_page,
     write_report,
+    write_seen,
 )
 from advtex_engine.runtime import Stages, WorkFolder, choose_device
 from advtex_engine.stages import (
@@ -93,11 +94,16 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
     memory = budget.report(work, stages.records[-1])
     touched, mean = maps[1].slot_map >= 0, given.means[1]
     with stages.run("dilation"):
-        texture = fill_holes(texture, touched)
+        seen = touched & given.facts.get("known", touched)
+        completed = complete_texture(atlas, texture, seen, gray=config.unseen == "gray")
+        texture = completed.texture
+        if config.unseen == "remove":
+            atlas = replace(atlas, mesh=keep_faces(atlas.mesh, completed.faces))
     with stages.run("export"):
         files = export_model(out, atlas, texture, up_axis=scene.up_axis, lossless=config.lossless, usdz=True)
+        files += write_seen(out, atlas, completed.state)
     with stages.run("previews"):
-        files += write_gallery(out, scene, atlas, texture, mean, curves(losses, given.live.quality))
+        files += write_gallery(out, scene, atlas, texture, mean, curves(losses, given.live.quality), completed.state)
         atlas = replace(atlas, mesh=atlas.mesh.to(torch.device("cpu")))
         scores = heldout_scores(scene, atlas, texture.cpu(), mean.cpu())
     parts = {
@@ -106,6 +112,7 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
         "refinement": refinement and refinement | given.facts.get("refinement", {}),
         "atlas": {key: getattr(atlas, key) for key in ("width", "height", "source", "charts", "pages")},
         "touched_texels": maps[1].slots,
+        "surface": completed.shares,
         "speckled_texels": speckle_share(texture, touched),
         "stages": stages.records,
         "saving_seconds": round(sum(folder.seconds for folder in {budget.folder, given.work}), 3),

@@ -16,9 +16,8 @@ from advtex_engine.atlas import ChartMaker, MeshPreparation, begin_charts, chart
 from advtex_engine.budget import Budget
 from advtex_engine.conventions import checked_conventions
 from advtex_engine.core import Diverged, Monitor, TextureConfig, WarningKeeper
-from advtex_engine.coverage import complete_texture
 from advtex_engine.ingest import FrameStore, read_capture
-from advtex_engine.mesh import MAX_FRAMES, fuse, keep_faces, register_mesh
+from advtex_engine.mesh import MAX_FRAMES, fuse, register_mesh
 from advtex_engine.methods import require, texture_function
 from advtex_engine.metrics.speckle import speckle_share
 from advtex_engine.previews.curves import curves
@@ -36,12 +35,14 @@ from advtex_engine.runtime import Stages, WorkFolder, choose_device
 from advtex_engine.stages import (
     MadeScene,
     cached_scene,
+    completed_model,
     fingerprint,
     fitting_atlas,
     fitting_view_maps,
     method_input,
     refined_scene,
 )
+from advtex_options.box import parse_box
 
 
 @dataclass(frozen=True)
@@ -95,10 +96,8 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
     touched, mean = maps[1].slot_map >= 0, given.means[1]
     with stages.run("dilation"):
         seen = touched & given.facts.get("known", touched)
-        completed = complete_texture(atlas, texture, seen, gray=config.unseen == "gray")
-        texture = completed.texture
-        if config.unseen == "remove":
-            atlas = replace(atlas, mesh=keep_faces(atlas.mesh, completed.faces))
+        atlas, completed = completed_model(atlas, texture, seen, made["mesh"]["made_up_faces"], config)
+    texture = completed.texture
     with stages.run("export"):
         files = export_model(out, atlas, texture, up_axis=scene.up_axis, lossless=config.lossless, usdz=True)
         files += write_seen(out, atlas, completed.state)
@@ -132,19 +131,24 @@ def _scene(
     """The scene, mesh and views within their budgets, and the report's parts about how it was made."""
     monitor = stages.monitor
     made: dict[str, Any] = {"conventions": None, "fusion": None, "registration": None}
-    with MeshPreparation(config.face_budget, charts) as preparation:
+    box = None if config.box is None else parse_box(config.box)
+    with MeshPreparation(config.face_budget, charts, box=box, holes=config.close_holes) as preparation:
         with stages.run("ingest"):
             capture = read_capture(
-                scan, config, store, monitor, lambda mesh, moves: preparation.begin(mesh, moves=moves != "none")
+                scan,
+                config,
+                store,
+                monitor,
+                lambda mesh, moves, up: preparation.begin(mesh, up_axis=up, moves=moves != "none"),
             )
         with stages.run("conventions"):
             made["conventions"] = checked_conventions(scan, capture.manifest, capture.mesh, monitor)
         if capture.mesh is None:
             with stages.run("fusion"):
                 fused, made["fusion"] = fuse(capture.measured(), device, monitor)
-            preparation.begin(fused)
+            preparation.begin(fused, up_axis=capture.up_axis)
         with stages.run("geometry"):
-            mesh = preparation.result(monitor)
+            mesh, made["mesh"] = preparation.result(monitor)
             capture, made["view_choice"] = capture.choose(mesh, config.max_views, monitor)
             scene = capture.scene(mesh, monitor)
             if capture.mesh_refinement != "none" and (frames := capture.measured(MAX_FRAMES)):

@@ -23,9 +23,9 @@ from advtex_engine.render.texture import fill_holes
 UNSEEN, GUESSED, SEEN = 0, 128, 255
 """The states, as `model_seen.png` has them. Texels between charts are as those beside them, or else UNSEEN."""
 GUESS_REACH = 0.05
+"""Metres: up to here, a guess is half as far from what was hidden for a test as the model's mean tone is."""
 GRAY = 0.5
 DETAIL_STEPS = 24  # texels over which the detail of seen texels fades
-FADING = 0.98  # of the mean of its neighbors: to a third within four texels
 
 
 @dataclass(frozen=True)
@@ -41,10 +41,13 @@ class Completed:
     shares: dict[str, float]
 
 
-def complete_texture(atlas: Atlas, texture: Tensor, seen: Tensor, *, gray: bool = False) -> Completed:
+def complete_texture(
+    atlas: Atlas, texture: Tensor, seen: Tensor, *, made_up: Tensor | None = None, gray: bool = False
+) -> Completed:
     """The texture with a guess wherever it is not seen. Not differentiable.
 
-    texture: [H,W,3] float in [0,1]; seen: [H,W] bool, texels that stay as they are; both on the atlas's device. gray:
+    texture: [H,W,3] float in [0,1]; seen: [H,W] bool, texels that stay as they are; both on the atlas's device.
+    made_up: [T] bool, faces that close holes: they keep what photographs show there, and never count as seen. gray:
     what is unseen is gray instead.
     """
     assert texture.shape == (atlas.height, atlas.width, 3)
@@ -52,18 +55,19 @@ def complete_texture(atlas: Atlas, texture: Tensor, seen: Tensor, *, gray: bool 
     texels, surface = map_texels(atlas), cut_at_folds(atlas.mesh)
     points = surface_points(atlas.mesh, texels)
     known = seen.flatten()[texels.texel]
-    reach = _seen_distance(surface, texels, points, known)
+    sure = known if made_up is None else known & ~made_up[texels.face]
+    reach = _seen_distance(surface, texels, points, sure)
+    reach = _nearer_texels(_links(atlas, texels, surface, ~sure), points, reach)
     links = _links(atlas, texels, surface, ~known)
-    reach = _nearer_texels(links, points, reach)
     color = _guess(surface, texels, links, texture.reshape(-1, 3)[texels.texel], known)
-    state = torch.where(known, SEEN, torch.where(reach <= GUESS_REACH, GUESSED, UNSEEN)).to(torch.uint8)
+    state = torch.where(sure, SEEN, torch.where(reach <= GUESS_REACH, GUESSED, UNSEEN)).to(torch.uint8)
     if gray:
         color[state == UNSEEN] = GRAY
     states = torch.zeros(seen.numel(), dtype=torch.uint8, device=seen.device)
     states[seen.flatten()] = SEEN
     states[texels.texel] = state
     whole = texture.reshape(-1, 3).clone()
-    whole[texels.texel[~known]] = color[~known].to(whole)
+    whole[texels.texel] = color.to(whole)
     mapped = seen.flatten().clone()
     mapped[texels.texel] = True
     # Between charts, so that filtering across their borders never bleeds.
@@ -143,7 +147,7 @@ def _guess(surface: SmoothSurface, texels: TexelMap, links: _Links, color: Tenso
     tone /= weights.sum(1, keepdim=True)
     difference = torch.where(known[:, None], four[:, :3] - tone, 0.0)
     for _ in range(DETAIL_STEPS):
-        difference[links.texel] = FADING * difference[links.neighbor].mean(1)
+        difference[links.texel] = difference[links.neighbor].mean(1)
     return torch.where(known[:, None], four[:, :3], (tone + difference).clamp(0, 1))
 
 

@@ -1,7 +1,6 @@
 """Meshes: read, cleaned, decimated, moved onto the depth, or fused from it."""
 
-from advtex_engine.mesh.faces import keep_faces
 from advtex_engine.mesh.fusion import fuse
 from advtex_engine.mesh.registration import MAX_FRAMES, register_mesh
 
-__all__ = ["MAX_FRAMES", "fuse", "keep_faces", "register_mesh"]
+__all__ = ["MAX_FRAMES", "fuse", "register_mesh"]

@@ -87,10 +87,11 @@ def _places(mesh: Mesh, kept: Tensor) -> Tensor:
         places.append(middles.view(-1, 3))
         outer = [torch.stack((corners[:, k], middles[:, k], middles[:, k - 1]), 1) for k in range(3)]
         corners = torch.cat((middles, *outer))
-    return torch.unique(torch.cat(places), dim=0)
+    distinct: Tensor = torch.unique(torch.cat(places), dim=0)
+    return distinct
 
 
 def _distance(points: Tensor, places: Tensor) -> float:
     """Metres between the two that are nearest."""
     rows = max(1, AT_A_TIME // len(points))
-    return min((float(torch.cdist(points, part).amin()) for part in places.split(rows)), default=math.inf)
+    return min((float(torch.cdist(points, part).amin()) for part in torch.split(places, rows)), default=math.inf)

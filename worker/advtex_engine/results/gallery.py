@@ -221,7 +221,10 @@ def _atlas_pictures(gallery: _Gallery, texture: Tensor, count: int) -> Iterator[
         if marked is not None:
             size = (page.shape[1], page.shape[0])
             area = cv2.resize(next(marked).cpu().numpy(), size, interpolation=cv2.INTER_AREA)
-            yield f"atlas_{number}_seen.jpg", to_bytes(tinted(torch.from_numpy(page / 255), torch.from_numpy(area)))
+            yield (
+                f"atlas_{number}_seen.jpg",
+                to_bytes(tinted(torch.from_numpy(page).float() / 255, torch.from_numpy(area))),
+            )
 
 
 def _pages(texture: Tensor, count: int) -> Iterator[Image]:

@@ -5,8 +5,9 @@ views/NNNN_photo.jpg, NNNN_render.jpg, NNNN_mean.jpg      the same of up to MAX_
 turntable/NN.jpg             the model from all around
 atlas_N.jpg                  the texture's pages
 thumbnail.jpg                a good view of the model, square
+photographs.json, .mjpeg     photographs with their cameras, see `photographs.py`
 curves.json                  see `curves.py`
-manifest.json                lists all but the first two; its paths are relative to the result's folder
+manifest.json                lists all but the first two and the stream; its paths are relative to the result's folder
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from advtex_engine.previews.turntable import SIZE, Circle, circle_cameras, facin
 from advtex_engine.render.pictures import contact_sheet, encode_jpeg, side_by_side, to_bytes
 from advtex_engine.render.render_view import GBuffer, gbuffer, gbuffers, shade
 from advtex_engine.results.initial_view import orbit
+from advtex_engine.results.photographs import photograph_stream
 from advtex_engine.runtime.files import write_atomically
 from advtex_engine.runtime.threads import in_threads, one_thread_each
 
@@ -71,12 +73,15 @@ def _write_pictures(
     pages = enumerate(_pages(texture, atlas.pages))
     atlases = gallery.save_all((f"atlas_{number}.jpg", page) for number, page in pages)
     (thumbnail,) = gallery.save_all([("thumbnail.jpg", _thumbnail(atlas, circle, coarse, renders))])
+    entries, stream = photograph_stream(scene, atlas, texture)
+    photographs = {"stream": gallery.write("photographs.mjpeg", stream), "views": entries}
     manifest = {
         "views": gallery.views,
         "turntable": gallery.turntable,
         "orbit": orbit(circle, scene.up_axis),
         "thumbnail": thumbnail,
         "atlas": atlases,
+        "photographs": gallery.write("photographs.json", _json(photographs)),
         "curves": gallery.write("curves.json", _json(curves)),
     }
     gallery.write("manifest.json", _json(manifest))

@@ -5,15 +5,16 @@ import { el } from "./base.js";
 const LIGHTS = { photographed: "As photographed", studio: "Studio light" };
 const BACKGROUNDS = { page: "As the page", light: "Light", gray: "Gray", dark: "Dark" };
 const SURFACES = { texture: "Texture", seen: "What was seen" };
-const SEEN = [ // of model_seen.png: the least gray value, the color that it is shown in, and what it means
-  { least: 171, color: [38, 139, 108], name: "seen" },
-  { least: 86, color: [224, 159, 31], name: "guessed from beside it" },
-  { least: 0, color: [190, 48, 48], name: "not seen" },
+const SEEN = [ // of model_seen.png: the least gray value, the color that it is shown in as in the result's pictures, and what it means
+  { least: 171, color: [150, 158, 163], name: "Seen" },
+  { least: 86, color: [255, 153, 0], name: "Guessed from beside it" },
+  { least: 0, color: [217, 0, 217], name: "Not seen" },
 ];
+const SEEN_SIDE = 2048; // texels of the picture that shows it
 
 /** -> a labeled choice. options: words by value. */
 export function choice(label, options, act) {
-  const select = el("select", { onchange: () => act(select.value) }, Object.entries(options).map(([value, words]) => el("option", { value }, words)));
+  const select = el("select", { "aria-label": label, onchange: () => act(select.value) }, Object.entries(options).map(([value, words]) => el("option", { value }, words)));
   return el("label", { class: "choose" }, label, select);
 }
 
@@ -62,10 +63,12 @@ export function seenChoice(viewer, images) {
 /** The picture in the colors of SEEN, as an address. */
 async function colored(image) {
   const bitmap = await createImageBitmap(await (await fetch(image)).blob());
-  const canvas = el("canvas", { width: bitmap.width, height: bitmap.height });
-  const context = canvas.getContext("2d");
-  context.drawImage(bitmap, 0, 0);
-  const pixels = context.getImageData(0, 0, bitmap.width, bitmap.height);
+  const scale = Math.min(1, SEEN_SIDE / Math.max(bitmap.width, bitmap.height));
+  const canvas = el("canvas", { width: Math.round(bitmap.width * scale), height: Math.round(bitmap.height * scale) });
+  const context = canvas.getContext("2d", { willReadFrequently: true });
+  context.imageSmoothingEnabled = false;
+  context.drawImage(bitmap, 0, 0, canvas.width, canvas.height);
+  const pixels = context.getImageData(0, 0, canvas.width, canvas.height);
   for (let at = 0; at < pixels.data.length; at += 4) {
     pixels.data.set(SEEN.find(({ least }) => pixels.data[at] >= least).color, at);
   }

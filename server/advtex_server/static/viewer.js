@@ -76,7 +76,7 @@ async function addPhotographs(bar, viewer, stage, url, { photographs, orbit }, a
 
 /** Only where it can be: WebXR takes the model that is loaded; Quick Look, which knows nothing of the session, a copy of the USDZ. */
 function arButton(viewer, usdz, said) {
-  const button = el("button", { type: "button", hidden: !viewer.canActivateAR, onclick: async () => {
+  return el("button", { type: "button", hidden: !viewer.canActivateAR, onclick: async () => {
     try {
       if (usdz && !viewer.iosSrc && document.createElement("a").relList.supports("ar")) {
         said.textContent = "Loading the model for AR …";
@@ -88,7 +88,6 @@ function arButton(viewer, usdz, said) {
       said.textContent = `AR cannot be started: ${error.message}`;
     }
   } }, "View in AR");
-  return button;
 }
 
 /** Pictures from all around, and a slider that turns them. */

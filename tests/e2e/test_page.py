@@ -222,12 +222,12 @@ def check_tools(page: Page) -> None:
     page.get_by_role("button", name="Measure").click()
     stage = page.locator(".stage").bounding_box()
     assert stage is not None
-    # The camera is 2 m from the square, of which 480 pixels show 1.6 m: all 72 rows of a photograph with f = 90.
+    focal = 90 * min(stage["width"] / 96, stage["height"] / 72)  # the stage holds the photograph, which is 2 m away
     for pixels_aside in (0, 90):
         page.mouse.click(stage["x"] + stage["width"] / 2 - pixels_aside, stage["y"] + stage["height"] / 2)
     told = page.get_by_text(re.compile(r"Distance: \d+\.\d cm"))
     expect(told).to_be_visible()
-    assert float(told.inner_text().split()[1]) == pytest.approx(30, abs=0.5)
+    assert float(told.inner_text().split()[1]) == pytest.approx(100 * 2 * 90 / focal, abs=0.5)
     page.get_by_role("button", name="Measure").click()
     photographs = page.get_by_role("button", name="Photographs where you stand")
     photographs.click()
@@ -407,6 +407,36 @@ def axe(request: pytest.FixtureRequest) -> str:
         command = [npm, "install", "--no-save", "--no-audit", "--no-fund", "--ignore-scripts"]
         subprocess.run(command, cwd=folder, check=True, capture_output=True, timeout=240)
     return script.read_text()
+
+
+IPHONE = """
+    const known = DOMTokenList.prototype.supports;
+    DOMTokenList.prototype.supports = function (token) { return token === "ar" || known.call(this, token); };
+    Object.defineProperty(navigator, "userAgent", { get: () => "iPhone" });
+    window.opened = new Promise((resolve) => {
+        HTMLAnchorElement.prototype.click = function () { resolve({ rel: this.rel, href: this.href }); };
+    });
+"""
+
+
+def test_quick_look_gets_the_usdz_without_the_session(web: Browsing, archive: Path) -> None:
+    with web.service.client() as client:
+        spec = JobSpec(upload_id=client.upload(archive).id)
+        job = client.create_job(spec, idempotency_key="for AR").id
+        client.wait_for_job(job, timeout=60)
+        usdz = next(file for file in client.get_job(job).results if file.name == "model.usdz")
+    page = web.page()
+    page.add_init_script(IPHONE)
+    page.goto(f"/jobs/{job}")
+    page.get_by_role("button", name="View in AR").click(timeout=VIEWER_MS)
+    opened = page.evaluate("opened")
+    assert opened["rel"] == "ar"
+    assert opened["href"].startswith("blob:"), "Quick Look sends no cookies"
+    blob = page.evaluate(
+        "async (address) => { const found = await (await fetch(address)).blob(); return [found.type, found.size]; }",
+        opened["href"].partition("#")[0],
+    )
+    assert blob == ["model/vnd.usdz+zip", usdz.size]
 
 
 def test_every_page_is_open_to_all_and_fits_every_screen(web: Browsing, axe: str, archive: Path) -> None:

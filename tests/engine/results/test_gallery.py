@@ -141,13 +141,14 @@ def read(path: Path) -> np.ndarray:
 def test_the_manifest_lists_every_picture(result: tuple[Path, Scene, Atlas, tuple[Path, ...]]) -> None:
     out, _, atlas, files = result
     manifest = json.loads((out / "previews/manifest.json").read_text())
-    usual, seen = {"views", "turntable", "orbit", "thumbnail", "atlas", "curves"}, {"turntable_seen", "atlas_seen"}
-    assert set(manifest) == usual | seen
+    usual = {"views", "turntable", "orbit", "thumbnail", "atlas", "photographs", "curves"}
+    assert set(manifest) == usual | {"turntable_seen", "atlas_seen"}
     assert [view["name"] for view in manifest["views"] if view["heldout"]] == sorted([HOSTILE, "color/09b.png"])
     assert len(manifest["views"]) == MAX_VIEWS
     named = [view[kind] for view in manifest["views"] for kind in ("photo", "render", "mean", "seen")]
     named += [*manifest["turntable_seen"], *manifest["atlas_seen"]]
     named += [*manifest["turntable"], *manifest["atlas"], manifest["thumbnail"], manifest["curves"]]
+    named += [manifest["photographs"], json.loads((out / manifest["photographs"]).read_text())["stream"]]
     others = {"previews/manifest.json", "previews/comparison.png", "previews/sheet.png"}
     assert sorted([*named, *others]) == sorted(path.relative_to(out).as_posix() for path in files)
     assert manifest["turntable"] == [f"previews/turntable/{frame:02d}.jpg" for frame in range(24)]

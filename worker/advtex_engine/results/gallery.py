@@ -8,8 +8,9 @@ turntable/NN_seen.jpg        the same in those colors
 atlas_N.jpg, atlas_N_seen.jpg
                              the texture's pages
 thumbnail.jpg                a good view of the model, square
+photographs.json, .mjpeg     photographs with their cameras, see `photographs.py`
 curves.json                  see `curves.py`
-manifest.json                lists all but the first two; its paths are relative to the result's folder
+manifest.json                lists all but the first two and the stream; its paths are relative to the result's folder
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from advtex_engine.previews.turntable import SIZE, Circle, circle_cameras, facin
 from advtex_engine.render.pictures import contact_sheet, encode_jpeg, side_by_side, to_bytes
 from advtex_engine.render.render_view import GBuffer, gbuffer, gbuffers, shade
 from advtex_engine.results.initial_view import orbit
+from advtex_engine.results.photographs import photograph_stream
 from advtex_engine.results.seen import marks, tinted
 from advtex_engine.runtime.files import write_atomically
 from advtex_engine.runtime.threads import in_threads, one_thread_each
@@ -84,6 +86,8 @@ def _write_pictures(
     )
     atlases = gallery.save_all(_atlas_pictures(gallery, texture, atlas.pages))
     (thumbnail,) = gallery.save_all([("thumbnail.jpg", _thumbnail(atlas, circle, coarse, renders))])
+    entries, stream = photograph_stream(scene, atlas, texture)
+    photographs = {"stream": gallery.write("photographs.mjpeg", stream), "views": entries}
     step = 1 if gallery.marked is None else 2
     manifest: dict[str, Any] = {
         "views": gallery.views,
@@ -91,6 +95,7 @@ def _write_pictures(
         "orbit": orbit(circle, scene.up_axis),
         "thumbnail": thumbnail,
         "atlas": atlases[::step],
+        "photographs": gallery.write("photographs.json", _json(photographs)),
         "curves": gallery.write("curves.json", _json(curves)),
     }
     if gallery.marked is not None:

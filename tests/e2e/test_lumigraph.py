@@ -57,14 +57,16 @@ def page(tmp_path: Path) -> Iterator[Page]:
 
 
 @pytest.mark.parametrize("eye", [(2.6, 1.0, 1.8), (1.9, -2.2, 0.9)], ids=["on the path", "beside it"])
-def test_the_browser_blends_photographs_as_torch_does(page: Page, tmp_path: Path, eye: tuple[float, ...]) -> None:
+def test_the_browser_blends_photographs_as_torch_does(
+    page: Page, tmp_path: Path, eye: tuple[float, float, float]
+) -> None:
     scene, atlas, texture = photographed_scene()
     export_model(tmp_path, atlas, texture, up_axis=scene.up_axis)
     entries, stream = photograph_stream(scene, atlas, texture)
     (tmp_path / "stream").write_bytes(stream)
-    colors = [cv2.imdecode(np.frombuffer(stream[e["offset"] :][: e["bytes"]], np.uint8), 1)[..., ::-1] for e in entries]
-    given = photographs(scene.mesh, [view.camera for view in scene.views], [torch.tensor(c.copy()) for c in colors])
-    place = camera(eye, 200, 150, 180.0)  # type: ignore[arg-type]
+    colors = [decoded(stream[entry["offset"] :][: entry["bytes"]]) for entry in entries]
+    given = photographs(scene.mesh, [view.camera for view in scene.views], colors)
+    place = camera(eye, 200, 150, 180.0)
     color, share = blended(scene.mesh, given, place)
     drawn = page.evaluate(DRAW, {"views": entries, "place": in_glb(place)})
     assert drawn["error"] == 0
@@ -74,6 +76,12 @@ def test_the_browser_blends_photographs_as_torch_does(page: Page, tmp_path: Path
     difference = np.abs(found - wanted).max(2)
     assert np.median(difference) < 0.01
     assert (difference > 0.06).mean() < 0.03, "other pixels are at edges, where rasterizers differ"
+
+
+def decoded(jpeg: bytes) -> torch.Tensor:
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    return torch.from_numpy(image[..., ::-1].copy())
 
 
 def in_glb(place: Camera) -> dict[str, object]:

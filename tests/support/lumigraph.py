@@ -85,8 +85,11 @@ def photographed_scene() -> tuple[Scene, Atlas, Tensor]:
 
     Returns the scene, its atlas, and the texture [H,W,3] in [0,1], which is gray.
     """
-    floor = trimesh.creation.box((4.0, 4.0, 0.1), trimesh.transformations.translation_matrix((0, 0, -0.6)))
-    mesh = of_trimesh(trimesh.util.concatenate([trimesh.creation.box((1.0, 0.8, 0.6)), floor]))
+    floor = trimesh.creation.box((4.0, 4.0, 0.1))
+    floor.apply_translation((0, 0, -0.6))
+    whole = trimesh.util.concatenate([trimesh.creation.box((1.0, 0.8, 0.6)), floor])
+    assert isinstance(whole, trimesh.Trimesh)
+    mesh = of_trimesh(whole)
     v_uv = torch.tensor([[0.1, 0.1], [0.9, 0.1], [0.1, 0.9]])
     t_uv_idx = torch.arange(3).expand(len(mesh.t_pos_idx), 3).contiguous()
     atlas = Atlas(Mesh(mesh.v_pos, mesh.t_pos_idx, v_uv, t_uv_idx), 64, 64, "scan", 1)

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
-import trimesh
 from lumigraph import photographed_scene
 
 from advtex_engine.core.cameras import project, scaled_camera
 from advtex_engine.core.scene import TO_Y_UP, Camera, View
 from advtex_engine.results.photographs import LONGEST_SIDE, MAX_HELDOUT, MAX_PHOTOGRAPHS, photograph_stream
+from advtex_scan.matrices import from_quaternion
 
 CORNER = torch.tensor([[0.5, 0.4, 0.3]])  # of the box
 
@@ -29,7 +29,7 @@ def read(entry: dict[str, Any], stream: bytes) -> Any:
 def test_each_lies_in_the_stream_and_has_its_camera_in_the_world_of_the_glb() -> None:
     scene, atlas, texture = photographed_scene()
     entries, stream = photograph_stream(replace(scene, up_axis="-x"), atlas, texture)
-    to_glb = trimesh.transformations.quaternion_matrix(np.roll(TO_Y_UP["-x"], 1))
+    to_glb = np.array(from_quaternion(*TO_Y_UP["-x"], (0.0, 0.0, 0.0)))
     assert [entry["name"] for entry in entries] == [view.name for view in scene.views]
     assert entries[-1]["offset"] + entries[-1]["bytes"] == len(stream)
     for entry, view in zip(entries, scene.views, strict=True):

@@ -17,6 +17,8 @@ from advtex_contract.jobs import WAITING, JobState
 from advtex_store.counters import ATTEMPTS, FAILURES, JOBS, STAGES, Line
 from advtex_store.store import Store
 
+READY = 1000  # that many are counted: no fleet begins more of them at once
+
 
 class Metrics:
     """One registry per application, so that tests can have several."""
@@ -68,6 +70,12 @@ class FleetCollector(Collector):
             troubles.add_metric([task, "yes" if aside else "no"], count)
         yield troubles
         yield GaugeMetricFamily("advtex_disk_free_bytes", "Room for uploads", self.store.blobs.free_bytes())
+        ready = GaugeMetricFamily(
+            "advtex_jobs_ready", "Waiting jobs that begin as soon as they have workers", labels=["memory_gib"]
+        )
+        for gib, count in sorted(self.store.records.ready(READY).items()):
+            ready.add_metric([str(gib)], count)
+        yield ready
         workers = GaugeMetricFamily("advtex_workers", "Living workers by memory for jobs", labels=["gib"])
         busy = GaugeMetricFamily("advtex_workers_busy", "Of these, those that have a job", labels=["gib"])
         try:

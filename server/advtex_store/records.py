@@ -251,6 +251,14 @@ class Records(Transitions):
         with self.database.read() as session:
             return next_jobs(session, limit, self.database.now(session), gib, offered)
 
+    def ready(self, limit: int) -> dict[int, int]:
+        """How many of the jobs that wait begin as soon as they have workers, by the GiB that they need; of those that
+        come first no more than `limit`."""
+        with self.database.read() as session:
+            found = [job.id for job in next_jobs(session, limit, self.database.now(session))]
+            query = select(JobRow.memory_gib, func.count()).where(JobRow.id.in_(found)).group_by(JobRow.memory_gib)
+            return {int(gib): int(count) for gib, count in session.execute(query)}
+
     def paused(self, offered: Collection[str]) -> set[str]:
         """Of the jobs that are on their way to a worker those whose batch was paused."""
         with self.database.read() as session:

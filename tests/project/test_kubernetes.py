@@ -176,7 +176,7 @@ def test_every_job_is_of_one_class_and_its_nodes_can_take_it() -> None:
     classes = {}
     for found in scaled_jobs():
         (waiting, busy) = counted(found)
-        assert waiting[:2] == ("advtex_jobs_waiting", "memory_gib")
+        assert waiting[:2] == ("advtex_jobs_ready", "memory_gib")
         assert busy[:2] == ("advtex_workers_busy", "gib")
         assert waiting[2] == busy[2]
         takes = [gib for gib in range(1000) if waiting[2].fullmatch(str(gib))]

@@ -17,7 +17,7 @@ from sqlalchemy import insert
 
 from advtex_store.ids import new_id
 from advtex_store.memory_estimate import GIB
-from advtex_store.models import JobRow
+from advtex_store.models import BatchRow, JobRow
 from advtex_store.store import Store
 
 TURN_SECONDS = 30.0  # between looks, of Prometheus and of KEDA
@@ -115,7 +115,7 @@ class Cluster:
         self.now += TURN_SECONDS
 
     def _scrape(self) -> Samples:
-        samples: Samples = {"advtex_jobs_waiting": {}, "advtex_workers_busy": {}}
+        samples: Samples = {"advtex_jobs_ready": {}, "advtex_workers_busy": {}}
         for family in text_string_to_metric_families(self.http.get("/metrics").text):
             if family.name in samples:
                 samples[family.name] = {next(iter(sample.labels.values())): sample.value for sample in family.samples}
@@ -142,12 +142,12 @@ def live(make_live: Callable[..., Any], redis_url: str) -> Any:
     return make_live(redis_url=redis_url, dispatch_seconds=3600.0, reconcile_seconds=3600.0)
 
 
-def add_jobs(store: Store, memories: Iterable[int]) -> list[str]:
+def add_jobs(store: Store, memories: Iterable[int], batch: str | None = None) -> list[str]:
     """A job for each of them, the GiB that it needs. -> their ids; they wait."""
     upload, now = store.uploads.create("me", 1).id, time.time()
     rows = [
         {"id": new_id(now), "owner": "me", "upload_id": upload, "state": "queued", "memory_bytes": gib * GIB}
-        | {"options": {}, "progress": {}, "warnings": [], "results": []}
+        | {"options": {}, "progress": {}, "warnings": [], "results": [], "batch": batch}
         | {"created_at": now, "updated_at": now, "retention_seconds": 86400, "checked_at": now}
         for gib in memories
     ]
@@ -201,3 +201,17 @@ def test_a_job_that_comes_while_others_run_has_a_worker_of_its_own(live: Any) ->
     cluster.run(24 * 3600)
     assert live.store.records.count_by_state().get("succeeded") == 7
     assert live.store.queue.workers() == []
+
+
+def test_what_may_not_begin_brings_up_nobody(live: Any) -> None:
+    """Of a batch that is paused none, and of one of which few run at a time no more than those."""
+    small, large = scaled_jobs()
+    add_jobs(live.store, [8] * 20, "paused")
+    few = add_jobs(live.store, [8] * 20, "few")
+    with live.store.database.write() as session:
+        session.add(BatchRow(owner="me", id="paused", paused_at=1.0, max_running=None, updated_at=1.0))
+        session.add(BatchRow(owner="me", id="few", paused_at=None, max_running=3, updated_at=1.0))
+    classes = [Class(small, few[:3], lambda _: 60.0), Class(large, [], lambda _: 60.0)]
+    Cluster(live.store, live.http, classes, lambda _: 1800.0).run(900)
+    assert [found.begun for found in classes] == [3, 0]
+    assert live.store.records.count_by_state().get("running") == 3

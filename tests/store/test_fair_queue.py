@@ -160,6 +160,15 @@ def test_one_long_line_is_read_as_far_as_it_is_needed(bench: Any) -> None:
     assert [job.id for job in bench.records.waiting(400)] == expected
 
 
+def test_what_may_begin_is_counted_by_the_memory_that_it_needs(bench: Any) -> None:
+    """Of a batch of which one job runs at a time, one."""
+    jobs = [Job("a")] * 3 + [Job("a", memory=3 * GIB)] * 2 + [Job("b", memory=3 * GIB, batch="x")] * 4
+    fill(bench, bench.finished_upload(), jobs)
+    bench.batches.limit("b", "x", 1)
+    assert bench.records.ready(100) == {1: 3, 3: 3}
+    assert sum(bench.records.ready(2).values()) == 2
+
+
 def batches_in_order(bench: Any, limit: int) -> list[str | None]:
     return [bench.records.job(job.id).batch for job in bench.records.waiting(limit)]
 

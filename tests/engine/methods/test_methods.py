@@ -133,6 +133,17 @@ def test_without_errors_every_method_finds_the_texture(name: str, around: Method
     assert (texture - truth())[seen].abs().quantile(0.99) < 0.05
 
 
+def test_view_selection_tells_where_it_shows_a_photograph_and_where_it_filled(tmp_path: Path) -> None:
+    atlas, texture = plane(), truth()
+    # From close by, the view's border leaves faces of which less is seen than a photograph must show to be chosen.
+    given = task(atlas, (view("near", atlas, texture, camera((0.4, 0.45, 0.5))),), tmp_path)
+    found, _ = texture_function("view_selection")(given)
+    known, touched = given.facts["known"], given.maps[1].slot_map >= 0
+    assert 0.1 < known.float().mean() < 0.9
+    assert (found - texture)[known & touched].abs().quantile(0.99) < 0.05
+    assert (touched & ~known).any(), "what is filled counts as a guess, though a view touches it"
+
+
 def test_a_face_goes_to_the_view_that_shows_it_on_most_pixels(around: MethodInput) -> None:
     """Against pixels counted in a rendering of face indices."""
     atlas, maps = around.atlas, around.maps[1]

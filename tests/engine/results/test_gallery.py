@@ -116,6 +116,7 @@ def test_what_is_not_seen_has_colors_of_its_own(result: tuple[Path, Scene, Atlas
     (path,) = write_seen(out, atlas, STATE)
     assert path == out / "model_seen.png"
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert image is not None
     assert np.array_equal(image, STATE.numpy()), "gray, of three values, as the texture lies"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from collections.abc import Iterable
 
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Histogram, generate_latest
@@ -13,7 +14,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from advtex_contract.jobs import WAITING, JobState
-from advtex_store.counters import ATTEMPTS, FAILURES, JOBS, STAGES
+from advtex_store.counters import ATTEMPTS, FAILURES, JOBS, STAGES, Line
 from advtex_store.store import Store
 
 
@@ -54,6 +55,7 @@ class FleetCollector(Collector):
         for state in JobState:
             jobs.add_metric([state.value], counts.get(state.value, 0))
         yield jobs
+        yield from _waiting(self.store.counters.lines())
         load = self.store.counters.load()
         yield GaugeMetricFamily("advtex_queue_depth", "Jobs that wait", sum(counts.get(state, 0) for state in WAITING))
         yield GaugeMetricFamily("advtex_queue_age_seconds", "Age of the oldest job that waits", load.oldest_seconds)
@@ -91,6 +93,19 @@ class FleetCollector(Collector):
                 families[row.name].add_metric([row.label], row.count)
         yield from families.values()
         yield stages
+
+
+def _waiting(lines: Iterable[Line]) -> Iterable[Metric]:
+    """By class: the memory of the smallest worker that can take them."""
+    waiting = GaugeMetricFamily("advtex_jobs_waiting", "Jobs that wait for a worker", labels=["memory_gib"])
+    oldest = GaugeMetricFamily("advtex_jobs_waiting_oldest_seconds", "Age of the oldest", labels=["memory_gib"])
+    classes = defaultdict[int, list[Line]](list)
+    for line in lines:
+        classes[line.memory_gib].append(line)
+    for gib, found in sorted(classes.items()):
+        waiting.add_metric([str(gib)], sum(line.jobs for line in found))
+        oldest.add_metric([str(gib)], max(line.oldest_seconds for line in found))
+    return waiting, oldest
 
 
 class MetricsMiddleware:

@@ -12,7 +12,8 @@ from sqlalchemy.orm import Session
 
 from advtex_contract.jobs import JobState
 from advtex_store.database import Database
-from advtex_store.models import KEPT, CounterRow, DeliveryRow, JobRow
+from advtex_store.ids import created_at
+from advtex_store.models import KEPT, WAITS_IN_LINE, CounterRow, DeliveryRow, JobRow
 
 # In the order in which one transaction may count: all in the same, or two of them could wait for each other.
 ATTEMPTS = "attempts"  # ended early, by how: lost, preempted
@@ -29,6 +30,16 @@ class Load:
     oldest_seconds: float
     steps_per_second: float
     deliveries: int
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """Jobs of one owner that wait for a worker of one class (`memory_gib`), and the age of the oldest in seconds."""
+
+    owner: str
+    memory_gib: int
+    jobs: int
+    oldest_seconds: float
 
 
 def count_one(session: Session, name: str, label: str, total: float = 0.0) -> None:
@@ -70,6 +81,14 @@ class Counters:
         query = select(JobRow.waiting_reason).where(JobRow.state == JobState.running, KEPT, JobRow.waiting_reason != "")
         with self.database.read() as session:
             return sorted(set(session.scalars(query)))
+
+    def lines(self) -> list[Line]:
+        """Where jobs wait: from the index of those that do, whatever else there is."""
+        query = select(JobRow.owner, JobRow.memory_gib, func.count(), func.min(JobRow.id)).where(WAITS_IN_LINE)
+        with self.database.read() as session:
+            now = self.database.now(session)
+            found = session.execute(query.group_by(JobRow.owner, JobRow.memory_gib)).all()
+        return [Line(owner, gib, jobs, now - created_at(oldest)) for owner, gib, jobs, oldest in found]
 
     def load(self) -> Load:
         """How much there is to do."""

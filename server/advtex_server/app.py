@@ -21,6 +21,7 @@ from advtex_server.dispatch import Dispatcher
 from advtex_server.events import Lookout
 from advtex_server.intake import Intake
 from advtex_server.metrics import Metrics, MetricsMiddleware
+from advtex_server.metrics_access import MetricsAccess
 from advtex_server.older_clients import OlderClientsMiddleware
 from advtex_server.refusal import ANYWHERE
 from advtex_server.routes import batches, health, jobs, pages, uploads, webhooks
@@ -38,10 +39,10 @@ def create_app(settings: ServerSettings) -> FastAPI:
     `app.state.stopping` is set by whoever stops the server, so that open event streams end at once.
     """
     store = open_store(settings)
-    dispatcher = Dispatcher(store, settings)
+    metrics = Metrics(store, settings.metrics_owners if settings.metrics_guarded else 0)
+    dispatcher = Dispatcher(store, settings, metrics.round)
     checker = Checker(store, settings, dispatcher.wake)
-    deliverer = Deliverer(store.webhooks, settings)
-    metrics = Metrics(store)
+    deliverer = Deliverer(store.webhooks, settings, lambda outcome: metrics.deliveries.labels(outcome).inc())
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -73,7 +74,6 @@ def create_app(settings: ServerSettings) -> FastAPI:
     )
     app.state.service = Service(store, settings, wake)
     app.state.webhooks = WebhookService(store.webhooks, deliverer.rules)
-    app.state.metrics = metrics
     app.state.stopping = asyncio.Event()
     app.state.intake = Intake(store, settings)
     app.state.bodies = OpenBodies()
@@ -81,6 +81,7 @@ def create_app(settings: ServerSettings) -> FastAPI:
     errors.install(app)
     authenticator = Authenticator(store.accounts, settings.auth_failures_per_minute)
     browser_sessions = BrowserSessions(store.sessions)
+    app.state.metrics_access = MetricsAccess(metrics, authenticator, settings)
     app.state.authenticator, app.state.browser_sessions = authenticator, browser_sessions
     app.add_middleware(
         AccessMiddleware,

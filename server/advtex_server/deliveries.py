@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import ssl
+from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import partial
 
@@ -26,10 +27,13 @@ log = structlog.get_logger("advtex.webhooks")
 
 
 class Deliverer:
-    """One task; any number of servers may run one."""
+    """One task; any number of servers may run one. count: told of each try whether it was `delivered` or `failed`."""
 
-    def __init__(self, webhooks: Webhooks, settings: ServerSettings) -> None:
+    def __init__(
+        self, webhooks: Webhooks, settings: ServerSettings, count: Callable[[str], None] = lambda _outcome: None
+    ) -> None:
         self.webhooks = webhooks
+        self._count = count
         self.rules = rules(settings)
         self._running: dict[str, asyncio.Task[None]] = {}
 
@@ -67,6 +71,7 @@ class Deliverer:
         bound = log.bind(webhook=delivery.webhook_id, delivery=delivery.id)
         try:
             error, gone = await self._send(client, delivery)
+            self._count("failed" if error else "delivered")
             if not error:
                 await run_in_threadpool(self.webhooks.delivered, delivery)
                 bound.info("delivered")

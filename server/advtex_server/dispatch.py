@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 
 import structlog
@@ -33,6 +33,8 @@ TOO_LARGE = (
     "it needs more memory than the {gib} GiB of the largest worker that is running; start a larger one, or submit it "
     "again with smaller views or a smaller texture"
 )
+
+Timed = Callable[[str, Callable[[], object]], object]
 
 log = structlog.get_logger("advtex.dispatch")
 
@@ -66,11 +68,15 @@ class Held:
 
 
 class Dispatcher:
-    """Two rhythms in one task: look for waiting jobs, and reconcile."""
+    """Two rhythms in one task: look for waiting jobs, and reconcile.
 
-    def __init__(self, store: Store, settings: ServerSettings) -> None:
+    timed: called with the kind of each round and what does it.
+    """
+
+    def __init__(self, store: Store, settings: ServerSettings, timed: Timed = lambda _kind, act: act()) -> None:
         self.store = store
         self.settings = settings
+        self._timed = timed
         self.retention = Retention(store.database, store.blobs)
         self._woken = asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -92,8 +98,8 @@ class Dispatcher:
             try:
                 if due:
                     reconciled = time.monotonic()
-                    await run_in_threadpool(self.reconcile)
-                await run_in_threadpool(self.dispatch)
+                    await run_in_threadpool(self._timed, "reconcile", self.reconcile)
+                await run_in_threadpool(self._timed, "dispatch", self.dispatch)
                 if self._ill:
                     log.info("dispatching again")
                 self._ill = False

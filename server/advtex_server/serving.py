@@ -10,12 +10,15 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 
 import uvicorn
+from fastapi import FastAPI
+from starlette.types import ASGIApp
 
 from advtex_server.app import create_app
 from advtex_server.embedded import EmbeddedRedis, SetupError, client_key, only_one
+from advtex_server.metrics_access import metrics_app
 from advtex_server.settings import ServerSettings
 from advtex_store.accounts import Accounts, key_id
 from advtex_store.database import Database, upgrade_database
@@ -91,15 +94,7 @@ async def _run(
     # for a tenth of a second.
     gc.collect()
     gc.freeze()
-    server = _Server(
-        uvicorn.Config(
-            app,
-            log_config=None,
-            access_log=False,
-            timeout_graceful_shutdown=settings.shutdown_seconds,
-            server_header=False,
-        )
-    )
+    server = _server(app, settings)
 
     def stop() -> None:
         server.force_exit = server.should_exit  # the second signal does not wait for open requests
@@ -113,12 +108,40 @@ async def _run(
         loop.add_signal_handler(number, stop)
     watcher = asyncio.create_task(_watch(server, children, ready))
     try:
-        await server.serve(sockets=[listener])
+        async with _metrics(app, settings, listener.getsockname()[0]):
+            await server.serve(sockets=[listener])
     finally:
         watcher.cancel()
         for child in reversed(children):
             child.ask_to_stop()
             await asyncio.to_thread(child.wait)
+
+
+def _server(app: ASGIApp, settings: ServerSettings) -> _Server:
+    config = uvicorn.Config(
+        app,
+        log_config=None,
+        access_log=False,
+        timeout_graceful_shutdown=settings.shutdown_seconds,
+        server_header=False,
+    )
+    return _Server(config)
+
+
+@contextlib.asynccontextmanager
+async def _metrics(app: FastAPI, settings: ServerSettings, host: str) -> AsyncIterator[None]:
+    """Serve the metrics at a port of their own, if they have one. SetupError."""
+    if settings.metrics_port is None:
+        yield
+        return
+    with _listen(host, settings.metrics_port) as listener:
+        server = _server(metrics_app(app), settings)
+        serving = asyncio.create_task(server.serve(sockets=[listener]))
+        try:
+            yield
+        finally:
+            server.should_exit = True
+            await serving
 
 
 async def _watch(server: uvicorn.Server, children: Sequence[Supervised], ready: Callable[[], None]) -> None:

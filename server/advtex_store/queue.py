@@ -106,14 +106,14 @@ class JobQueue:
     def workers(self, host: str = "") -> list[str]:
         """Names of the living workers, of one host or of all."""
         found = self.redis.scan_iter(match=PRESENCE + "*", count=SCANNED)
-        names = sorted(_text(key).removeprefix(PRESENCE) for key in found)
+        names = sorted(text_of(key).removeprefix(PRESENCE) for key in found)
         return [name for name in names if not host or name.rpartition("-")[0] == host]
 
     def classes(self) -> list[WorkerClass]:
         """The classes of which workers live, smallest first."""
         names = self.workers()
         told = self.redis.mget([PRESENCE + name for name in names]) if names else []
-        known = [_text(value) for value in told if value is not None]
+        known = [text_of(value) for value in told if value is not None]
         count = Counter(int(value.removesuffix(BUSY)) for value in known)
         idle = Counter(int(value) for value in known if not value.endswith(BUSY))
         return [WorkerClass(gib, workers, idle[gib]) for gib, workers in sorted(count.items())]
@@ -157,13 +157,13 @@ class JobQueue:
         pipeline = self.redis.pipeline()
         pipeline.zremrangebyscore(DECLINED, "-inf", time.time())
         pipeline.zrange(DECLINED, 0, -1)
-        return [_text(name) for name in pipeline.execute()[1]]
+        return [text_of(name) for name in pipeline.execute()[1]]
 
     def withdraw(self, keep: set[int]) -> None:
         """Take back what waits for workers of classes that are not in `keep`: nobody listens there any more."""
         kept = {queue_name(gib) for gib in keep}
         for raw in self.redis.smembers(Queue.redis_queues_keys):
-            name = _text(raw).removeprefix(Queue.redis_queue_namespace_prefix)
+            name = text_of(raw).removeprefix(Queue.redis_queue_namespace_prefix)
             if not name.startswith(QUEUE) or name in kept:
                 continue
             self._remove(name, 0)
@@ -174,7 +174,7 @@ class JobQueue:
 
     def _remove(self, queue: str, first: int) -> list[str]:
         removed, key = [], _key(queue)
-        for name in map(_text, self.redis.lrange(key, first, -1)):
+        for name in map(text_of, self.redis.lrange(key, first, -1)):
             if self.redis.lrem(key, 1, name):  # else a worker has just come and taken it
                 removed.append(name)
                 with suppress(NoSuchJobError):
@@ -190,7 +190,7 @@ class JobQueue:
         pipeline = self.redis.pipeline(transaction=False)
         for gib in classes:
             pipeline.lrange(_key(queue_name(gib)), 0, -1)
-        return {gib: [_text(name) for name in found] for gib, found in zip(classes, pipeline.execute(), strict=True)}
+        return {gib: [text_of(name) for name in found] for gib, found in zip(classes, pipeline.execute(), strict=True)}
 
     def _fetch(self, name: str) -> Job:
         return Job.fetch(name, connection=self.redis, serializer=JSONSerializer)
@@ -219,5 +219,6 @@ def _key(name: str) -> str:
     return f"{Queue.redis_queue_namespace_prefix}{name}"
 
 
-def _text(raw: bytes | str) -> str:
+def text_of(raw: bytes | str) -> str:
+    """What Redis has answered."""
     return raw.decode() if isinstance(raw, bytes) else raw

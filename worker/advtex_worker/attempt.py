@@ -204,7 +204,9 @@ class Attempt:
         self._check_ending()
         self._warnings = base.warnings
         self._log.info("attempt begins", resumed_files=len(base.files))
-        uploader = CheckpointUploader(self._store.blobs, self._job_id, self._number, base, self._keeper.held)
+        saved = partial(self._store.live_progress.saved, self._job_id, self._number)
+        saved()
+        uploader = CheckpointUploader(self._store.blobs, self._job_id, self._number, base, self._keeper.held, saved)
         poster = LivePoster(self._store.live, self._job_id, self._number, self._keeper.held)
         ended: FinishedEvent | FailedEvent | StoppedEvent | None = None
         try:

@@ -30,10 +30,12 @@ from sqlalchemy.exc import SQLAlchemyError
 from advtex_scan.version import product_version
 from advtex_store.database import read_schema
 from advtex_store.errors import SchemaRefused
+from advtex_store.fleet import Fleet, WorkerReport
 from advtex_store.logs import configure_logs
 from advtex_store.process_ends import die_with_parent
 from advtex_store.queue import JobQueue, attempt_of, class_of, connect_redis, queue_name
 from advtex_store.secrecy import hide_environment
+from advtex_worker.gpu_readings import GpuWatch
 from advtex_worker.settings import WorkerSettings
 from advtex_worker.slots import Slot, find_slots, hold, settings_of, supervise
 from advtex_worker.tasks import Host, serve_as
@@ -55,13 +57,18 @@ class JobWorker(Worker):
 
     max_connection_wait_time = RECONNECT_SECONDS
 
-    def __init__(self, host: Host, connection: Any, stopping: threading.Event, gib: int) -> None:
+    def __init__(
+        self, host: Host, connection: Any, stopping: threading.Event, gib: int, gpu: GpuWatch | None = None
+    ) -> None:
         self._host = host
         self._stopping = stopping
         self._gib = gib
         self._parent_pid = os.getpid()
         self._presence = JobQueue(connection)
+        self._fleet = Fleet(self._presence)
+        self._gpu = gpu
         self._busy = False
+        self._report = WorkerReport(host=socket.gethostname(), release=product_version())
         self._known_as = f"{socket.gethostname()}-{self._parent_pid}"
         super().__init__(
             [queue_name(gib)],
@@ -77,6 +84,8 @@ class JobWorker(Worker):
 
     def _announce(self, pipeline: Any = None) -> None:
         self._presence.announce(self._known_as, self._gib, pipeline, busy=self._busy)
+        reading = None if self._gpu is None else self._gpu.newest
+        self._fleet.tell(self._known_as, self._report.model_copy(update={"gpu": reading}), pipeline)
 
     def heartbeat(self, timeout: int | None = None, pipeline: Any = None) -> None:
         super().heartbeat(timeout, pipeline)
@@ -109,15 +118,16 @@ class JobWorker(Worker):
         """The work-horse inherits the context: its lines and RQ's own name the job in both processes."""
         job_id, attempt = attempt_of(job.id)
         with structlog.contextvars.bound_contextvars(job=job_id, attempt=attempt):
-            self._tell(busy=True)
+            self._tell(busy=True, job=job_id, attempt=attempt, since=time.time())
             try:
                 super().execute_job(job, queue)
             finally:
-                self._tell(busy=False)
+                self._tell(busy=False, job="", attempt=0, since=None)
 
-    def _tell(self, *, busy: bool) -> None:
+    def _tell(self, *, busy: bool, **attempt: object) -> None:
         """At once: until the next sign of life the dispatcher would count on a worker that has a job."""
         self._busy = busy
+        self._report = self._report.model_copy(update=attempt)
         with suppress(RedisError):
             self._announce()
 
@@ -189,9 +199,10 @@ def work(host: Host, slot: Slot) -> None:
     gib = class_of(slot.memory_bytes)
     _lock = hold(slot, host.settings.jobs_per_gpu, time.sleep)
     log.info("worker takes jobs", memory_gib=gib, gpu=slot.gpu)
+    gpu = GpuWatch(slot.gpu)
     while not stopping.is_set():
         try:
-            JobWorker(host, connect_redis(host.settings), stopping, gib).work(logging_level="WARNING")
+            JobWorker(host, connect_redis(host.settings), stopping, gib, gpu).work(logging_level="WARNING")
             if not stopping.is_set():
                 log.warning("the connection to Redis broke; connecting again")
         except RedisError as error:

@@ -31,6 +31,7 @@ from advtex_server.tus import TusMiddleware
 from advtex_server.webhooks import WebhookService
 from advtex_store.database import upgrade_database
 from advtex_store.store import open_store
+from advtex_store.tracing import open_traces
 
 
 def create_app(settings: ServerSettings) -> FastAPI:
@@ -39,10 +40,11 @@ def create_app(settings: ServerSettings) -> FastAPI:
     `app.state.stopping` is set by whoever stops the server, so that open event streams end at once.
     """
     store = open_store(settings)
+    traces = open_traces("advtex-server")
     metrics = Metrics(store, settings.metrics_owners if settings.metrics_guarded else 0)
-    dispatcher = Dispatcher(store, settings, metrics.round)
-    checker = Checker(store, settings, dispatcher.wake)
-    deliverer = Deliverer(store.webhooks, settings, lambda outcome: metrics.deliveries.labels(outcome).inc())
+    dispatcher = Dispatcher(store, settings, metrics.round, traces)
+    checker = Checker(store, settings, dispatcher.wake, traces)
+    deliverer = Deliverer(store.webhooks, settings, metrics.delivered, traces)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -57,6 +59,7 @@ def create_app(settings: ServerSettings) -> FastAPI:
             with suppress(asyncio.CancelledError):
                 await task
         await asyncio.to_thread(checker.stop)
+        await asyncio.to_thread(traces.close)
         store.close()
 
     def wake() -> None:
@@ -72,10 +75,10 @@ def create_app(settings: ServerSettings) -> FastAPI:
         docs_url=None,  # their pages load scripts from elsewhere
         redoc_url=None,
     )
-    app.state.service = Service(store, settings, wake)
+    app.state.service = Service(store, settings, wake, traces)
     app.state.webhooks = WebhookService(store.webhooks, deliverer.rules)
     app.state.stopping = asyncio.Event()
-    app.state.intake = Intake(store, settings)
+    app.state.intake = Intake(store, settings, traces)
     app.state.bodies = OpenBodies()
     app.state.lookout = Lookout(app.state.service)
     errors.install(app)

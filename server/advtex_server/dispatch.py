@@ -23,6 +23,7 @@ from advtex_store.fair_queue import WaitingJob
 from advtex_store.queue import WorkerClass, rq_id
 from advtex_store.retention import Retention
 from advtex_store.store import Store
+from advtex_store.tracing import OFF, Traces
 from advtex_store.troubles import ADOPT
 
 SPOOL_SECONDS = 86400.0  # leftovers of killed uploads are removed after this long
@@ -73,8 +74,15 @@ class Dispatcher:
     timed: called with the kind of each round and what does it.
     """
 
-    def __init__(self, store: Store, settings: ServerSettings, timed: Timed = lambda _kind, act: act()) -> None:
+    def __init__(
+        self,
+        store: Store,
+        settings: ServerSettings,
+        timed: Timed = lambda _kind, act: act(),
+        traces: Traces = OFF,
+    ) -> None:
         self.store = store
+        self._traces = traces
         self.settings = settings
         self._timed = timed
         self.retention = Retention(store.database, store.blobs)
@@ -217,3 +225,8 @@ class Dispatcher:
         with suppress(StaleAttempt):
             state = self.store.records.lost(job_id, attempt, expired_only=True)
             log.warning("lease expired", job=job_id, attempt=attempt, state=state)
+            if self._traces.on:
+                lost = self._traces.span(
+                    "lost", self.store.records.job(job_id).traceparent, job=job_id, attempt=attempt
+                )
+                lost.end("its worker died or cannot be reached", state=state)

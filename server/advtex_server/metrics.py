@@ -77,6 +77,10 @@ class Metrics:
         self.round_at.set_to_current_time()
         return done
 
+    def delivered(self, outcome: str) -> None:
+        """A delivery of a webhook was tried: `delivered` or `failed`."""
+        self.deliveries.labels(outcome).inc()
+
     def exposition(self) -> tuple[bytes, str]:
         """Text and its media type."""
         return generate_latest(self.registry), CONTENT_TYPE_LATEST

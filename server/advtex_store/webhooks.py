@@ -149,6 +149,12 @@ class Webhooks:
             )
             return hook.disabled_at is not None
 
+    def traceparent(self, delivery: Delivery) -> str | None:
+        """Of the job that it tells of."""
+        job_id = JobEvent.model_validate_json(delivery.body).data.id
+        with self.database.read() as session:
+            return session.scalar(select(JobRow.traceparent).where(JobRow.id == job_id))
+
     def drop_old(self) -> int:
         """Forget what could not be delivered for long. -> how many there were."""
         with self.database.read() as session:

@@ -55,6 +55,7 @@ from advtex_worker.lease import Ending, LeaseKeeper
 from advtex_worker.live import LivePoster
 from advtex_worker.progress import ProgressTracker
 from advtex_worker.settings import WorkerSettings
+from advtex_worker.tracing import NOT_TRACED, AttemptTrace
 
 RETRY_SECONDS = 5.0
 KILL_SECONDS = 1.0  # after a cancel: a runner whose interpreter is held by native code does not hear it
@@ -139,8 +140,11 @@ def sweep(workspaces: Path) -> None:
 class Attempt:
     """Carries a claimed job to one of its ends. `stop` may be called at any time, also from a signal handler."""
 
-    def __init__(self, store: Store, settings: WorkerSettings, engine: str, claim: Claim) -> None:
+    def __init__(
+        self, store: Store, settings: WorkerSettings, engine: str, claim: Claim, trace: AttemptTrace = NOT_TRACED
+    ) -> None:
         self._store = store
+        self._trace = trace
         self._settings = settings
         self._engine = engine
         self._job_id = claim.job_id
@@ -268,6 +272,7 @@ class Attempt:
             match event:
                 case StageEvent():
                     tracker.stage(event)
+                    self._trace.stage(event)
                 case ProgressEvent():
                     tracker.progress(event)
                 case WarningEvent():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import secrets
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -151,7 +152,7 @@ class Webhooks:
 
     def traceparent(self, delivery: Delivery) -> str | None:
         """Of the job that it tells of."""
-        job_id = JobEvent.model_validate_json(delivery.body).data.id
+        job_id = json.loads(delivery.body)["data"]["id"]
         with self.database.read() as session:
             return session.scalar(select(JobRow.traceparent).where(JobRow.id == job_id))
 

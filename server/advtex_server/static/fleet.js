@@ -104,7 +104,8 @@ function failures(fleet) {
     el("ul", { class: "findings" }, cause.newest.map((job) => el("li", { class: "error" },
       el("span", {}, jobName(job.id, job.owner, job.label), ` ${job.owner}, `,
         moment(new Date(job.finished_at * 1000).toISOString())),
-      el("span", { class: "remedy" }, job.message))))));
+      el("span", { class: "remedy" }, job.message)))),
+    el("p", { class: "hint" }, el("a", { href: `/errors#job-${cause.cause}` }, "What it means, and what helps"))));
 }
 
 function show(fleet) {

@@ -78,8 +78,11 @@ def _trouble(view: FleetView) -> Text:
 def _worker_rows(view: FleetView) -> list[tuple[bool, Row]]:
     """Whether it is at work, and its line."""
     living = sorted(view.workers or [], key=lambda found: (found.memory_gib, not found.busy, found.name))
-    rows = [(found.busy, (*_worker(found), *_work(found.work, busy=found.busy))) for found in living]
-    return rows + [(True, ("?", str(work.memory_gib), "", *_work(work, busy=True))) for work in view.elsewhere]
+    rows: list[tuple[bool, Row]] = [
+        (found.busy, (*_worker(found), *_work(found.work, busy=found.busy))) for found in living
+    ]
+    rows += [(True, ("?", str(work.memory_gib), "", *_work(work, busy=True))) for work in view.elsewhere]
+    return rows
 
 
 def _worker(found: WorkerView) -> Row:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from checked import queued_job
-
-from advtex_contract.jobs import JobError, JobSpec, Progress
+from advtex_contract.jobs import JobError, JobState, Progress
 from advtex_store.fleet import GpuReading, WorkerReport
+from advtex_store.ids import new_id
+from advtex_store.models import JobRow, UploadRow
 from advtex_store.store import Store
 
 GIB = 1 << 30
@@ -17,12 +17,10 @@ FAILURES = (
 
 
 def gather(store: Store, jobs: int = 24) -> None:
-    """No other job may wait for its check. Jobs that wait need more memory than any worker has that takes jobs."""
+    """Jobs that wait need more memory than any worker has that takes jobs."""
     for number in range(jobs):
         owner = OWNERS[number % len(OWNERS)]
-        upload = store.uploads.create(owner, 3, "scan.zip")
-        store.uploads.finish(upload.id, "ab" * 32)
-        job = queued_job(store, owner, JobSpec(upload_id=upload.id, label=f"scan {number}"), (900 + number % 2) * GIB)
+        job = _waiting(store, owner, f"scan {number}", (900 + number % 2) * GIB)
         name, part = f"gpu-node-{number % 3}-{1000 + number}", number % 4
         if part == 0:
             continue
@@ -43,3 +41,30 @@ def gather(store: Store, jobs: int = 24) -> None:
         else:
             store.records.succeed(job, 1, [])
     store.queue.announce("gpu-node-9-7", 80)
+
+
+def _waiting(store: Store, owner: str, label: str, memory_bytes: int) -> str:
+    """A row that no server checks: it waits from its beginning."""
+    with store.database.write() as session:
+        now = store.database.now(session)
+        upload = UploadRow(id=new_id(now), owner=owner, size=3, offset=3, sha256="ab" * 32, created_at=now)
+        session.add(upload)
+        session.flush()
+        job = JobRow(
+            id=new_id(now),
+            owner=owner,
+            upload_id=upload.id,
+            state=JobState.queued.value,
+            label=label,
+            options={},
+            memory_bytes=memory_bytes,
+            checked_at=now,
+            progress=Progress().model_dump(mode="json"),
+            warnings=[],
+            results=[],
+            created_at=now,
+            updated_at=now,
+            retention_seconds=1000,
+        )
+        session.add(job)
+        return job.id

@@ -14,6 +14,11 @@ RUN --mount=type=cache,target=/root/.cache/pip \
 COPY . .
 RUN --mount=type=cache,target=/root/.cache/pip \
     /opt/advtex/bin/pip install --constraint constraints.txt '.[worker]'
+# What is installed, as CycloneDX: docker run --rm --entrypoint cat advtex-worker /opt/advtex/sbom.json
+RUN --mount=type=cache,target=/root/.cache/pip \
+    python -m venv /opt/sbom \
+    && /opt/sbom/bin/pip install --constraint constraints.txt cyclonedx-bom==7.5.0 \
+    && /opt/sbom/bin/cyclonedx-py environment --output-file /opt/advtex/sbom.json /opt/advtex/bin/python
 
 FROM python:3.12.11-slim-bookworm
 # Triton compiles what launches its kernels; versions are the base image's.

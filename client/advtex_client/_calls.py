@@ -27,6 +27,7 @@ from advtex_contract.errors import ErrorCode
 from advtex_contract.health import Alive, KeyView, Readiness
 from advtex_contract.jobs import (
     TERMINAL,
+    BatchLimits,
     BatchPage,
     BatchView,
     JobPage,
@@ -124,6 +125,14 @@ def list_batches(limit: int, cursor: str | None) -> Call[BatchPage]:
 
 def cancel_batch(batch_id: str) -> Call[BatchView]:
     return Call("POST", f"{_batch(batch_id)}/cancel", reader(BatchView))
+
+
+def pause_batch(batch_id: str, paused: bool) -> Call[BatchView]:
+    return Call("POST", f"{_batch(batch_id)}/{'pause' if paused else 'resume'}", reader(BatchView))
+
+
+def limit_batch(batch_id: str, limits: BatchLimits) -> Call[None]:
+    return Call("PUT", f"{_batch(batch_id)}/limits", _nothing, json=limits.model_dump(mode="json"))
 
 
 def retry_batch(batch_id: str) -> Call[BatchView]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -22,7 +23,7 @@ from advtex_client.errors import (
     ServerError,
     WaitTimeoutError,
 )
-from advtex_client.manifests import retention_seconds
+from advtex_client.manifests import deadline_of, retention_seconds
 from advtex_contract.options import JobOptions, chosen_options
 
 EXIT_CODES: dict[type[ClientError], int] = {
@@ -52,6 +53,11 @@ KeepOption = Annotated[
     float | None, typer.Option("--keep-days", help="how long a job is kept after its end; else the server's usual time")
 ]
 
+DeadlineOption = Annotated[
+    str | None,
+    typer.Option("--deadline", metavar="TIME", help="by when a job is to have ended, such as 2026-01-31T08:00"),
+]
+
 
 def exit_code_of(error: ClientError) -> int:
     return next((code for kind, code in EXIT_CODES.items() if isinstance(error, kind)), USAGE)
@@ -78,6 +84,14 @@ def retention(keep_days: float | None) -> int | None:
         return None if keep_days is None else retention_seconds(keep_days)
     except ValueError as error:
         raise ClientError(f"--keep-days {keep_days}: {error}") from error
+
+
+def deadline_given(text: str | None) -> datetime | None:
+    """Return `--deadline` as a time. Raises ClientError."""
+    try:
+        return None if text is None else deadline_of(text)
+    except (ValueError, OverflowError) as error:
+        raise ClientError(f"--deadline {text}: {error}; give a time such as 2026-01-31T08:00") from error
 
 
 def job_options(given: Mapping[str, object]) -> JobOptions:

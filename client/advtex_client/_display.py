@@ -167,6 +167,9 @@ def job_lines(job: JobView) -> str:
     lines = [f"job      {job.id}", f"state    {job.state}" + (f" (attempt {job.attempt})" if job.attempt > 1 else "")]
     if job.waiting_reason:
         lines.append(f"waits    {job.waiting_reason}")
+    if job.deadline:
+        due = f"{job.deadline.astimezone():%Y-%m-%d %H:%M}"
+        lines.append(f"due      {due}{', late' if job.late else ''}")
     if job.label:
         lines.append(f"label    {job.label}")
     if progress.stage:
@@ -218,6 +221,10 @@ def batch_line(batch: BatchView, reasons: Sequence[str] = ()) -> str:
     parts = [f"{batch.jobs} jobs", *(f"{count} {state}" for state, count in sorted(batch.states.items()))]
     if batch.eta_seconds and not batch.finished:
         parts.append(f"about {duration(batch.eta_seconds)} left")
+    if batch.paused:
+        parts.append("paused")
+    if batch.max_running is not None:
+        parts.append(f"{batch.max_running} at a time")
     why = f"; waiting: {'; '.join(reasons)}" if reasons else ""
     return f"{batch.id}: {', '.join(parts)}{why}"
 
@@ -225,14 +232,22 @@ def batch_line(batch: BatchView, reasons: Sequence[str] = ()) -> str:
 def batch_table(rows: Sequence[dict[str, Any]]) -> str:
     """List what the jobs of a batch came to, with a column per score."""
     scores = list(dict.fromkeys(name for row in rows for name in row.get("scores", {})))
-    table = Table(box=None, pad_edge=False)
-    for title in ("label", "state", "steps", "time", *scores):
-        table.add_column(title, overflow="fold", justify="left" if title in ("label", "state") else "right")
+    lines = []
     for row in rows:
         found = row.get("scores", {})
         shown = [f"{found[name]:.4g}" if name in found else "" for name in scores]
         spent = duration(row["seconds"]) if row["seconds"] else ""
-        table.add_row(row["label"] or row["job"], row["state"], str(row["steps"] or ""), spent, *shown)
+        lines.append([row["label"] or row["job"], row["state"], str(row["steps"] or ""), spent, *shown])
+    return drawn_table(["label", "state", "steps", "time", *scores], lines)
+
+
+def drawn_table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Draw a table of text; the label and the state stand to the left, numbers to the right."""
+    table = Table(box=None, pad_edge=False)
+    for title in titles:
+        table.add_column(title, overflow="fold", justify="left" if title in ("label", "state") else "right")
+    for row in rows:
+        table.add_row(*row)
     return _drawn(table)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Generator
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ def job_spec(
     batch: str | None = None,
     priority: int = 0,
     retention_seconds: int | None = None,
+    deadline: datetime | None = None,
 ) -> JobSpec:
     """Return what to ask for, with no upload yet. Raises ClientError for what no server would accept."""
     options = options or JobOptions()
@@ -43,6 +45,7 @@ def job_spec(
             batch=batch,
             priority=priority,
             retention_seconds=retention_seconds,
+            deadline=deadline,
         )
     except ValidationError as error:
         first = error.errors()[0]

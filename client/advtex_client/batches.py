@@ -7,25 +7,29 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
+from datetime import datetime
 from itertools import islice
+from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from advtex_client._display import finding_lines
 from advtex_client._submission import job_spec
 from advtex_client.client import Client
-from advtex_client.errors import ApiError, AuthError, BusyError, ClientError, NetworkError
+from advtex_client.errors import ApiError, AuthError, BusyError, ClientError, NetworkError, NotFoundError
 from advtex_client.manifests import BatchItem
 from advtex_client.submissions import SubmissionMemory, write_whole
 from advtex_contract.errors import ErrorCode
 from advtex_contract.jobs import PENDING, BatchView, JobSpec, JobView
 from advtex_contract.options import JobOptions
 
-REPORT = "report.json"
-AT_ONCE = 4  # requests for scans by reference; scans that are sent go one after the other
+REPORT, THUMBNAIL = "report.json", "previews/thumbnail.jpg"
+AT_ONCE = 4  # requests for scans by reference and for results; scans that are sent go one after the other
 ASKED_WHY = 100  # jobs that are asked why they wait
 FULL_SECONDS = 15.0  # between looks whether a quota has room again
 
@@ -52,6 +56,7 @@ class BatchRun(BaseModel):
     options: JobOptions
     priority: int
     retention_seconds: int | None = None
+    deadline: datetime | None = None
 
 
 def remember(server: str, batch_id: str, run: BatchRun, folder: Path | None = None) -> None:
@@ -107,15 +112,56 @@ def waiting_reasons(client: Client, batch: BatchView) -> list[str]:
     return [reason for reason, _ in found.most_common()]
 
 
+def report_rows(client: Client, batch_id: str, thumbnails: dict[str, bytes] | None = None) -> Iterator[dict[str, Any]]:
+    """Yield a batch's jobs, sorted by label, with all that tells how each went. Put their pictures (JPEG), by the job's
+    id, into `thumbnails`."""
+    jobs = sorted(client.list_jobs(batch=batch_id), key=lambda job: (job.label, job.id))
+
+    def row(job: JobView) -> dict[str, Any]:
+        if thumbnails is not None and (picture := _result(client, job, THUMBNAIL)) is not None:
+            thumbnails[job.id] = picture
+        return _report_row(client, job)
+
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        yield from pool.map(row, jobs)
+
+
+def _report_row(client: Client, job: JobView) -> dict[str, Any]:
+    stages = job.progress.stage_seconds
+    row: dict[str, Any] = {"label": job.label, "job": job.id, "state": job.state, "attempt": job.attempt}
+    row |= {"steps": job.progress.steps, "gpu_seconds": round(sum(stages.values()), 1), "stage_seconds": stages}
+    if job.deadline is not None:
+        row |= {"deadline": job.deadline.isoformat(), "late": job.late}
+    if job.finished_at is not None:
+        row["elapsed_seconds"] = round((job.finished_at - job.created_at).total_seconds(), 1)
+    if job.error is not None:
+        row["reason"] = "\n".join([job.error.message, *finding_lines(job.error.details)])
+    elif job.waiting_reason:
+        row["reason"] = job.waiting_reason
+    return row | {"scores": _scores(client, job)}
+
+
 def _scores(client: Client, job: JobView) -> dict[str, float]:
     """Return the means over the held-out views, from the job's report; empty if none was held out."""
-    with TemporaryDirectory(prefix="advtex-") as folder:
-        (path,) = client.download_results(job, Path(folder), names=[REPORT])
-        try:
-            found = (json.loads(path.read_bytes()).get("heldout") or {}).get("texture") or {}
-            return {name: value for name, value in found.items() if name != "views" and isinstance(value, float)}
-        except (ValueError, AttributeError):
-            return {}
+    try:
+        found = (json.loads(_result(client, job, REPORT) or b"{}").get("heldout") or {}).get("texture") or {}
+        return {name: value for name, value in found.items() if name != "views" and _is_score(value)}
+    except (ValueError, AttributeError):
+        return {}
+
+
+def _is_score(value: object) -> bool:
+    return isinstance(value, float) and isfinite(value)
+
+
+def _result(client: Client, job: JobView, name: str) -> bytes | None:
+    """Return a small file of the job's results, None where it has none or is gone by now."""
+    if not any(file.name == name for file in job.results):
+        return None
+    with TemporaryDirectory(prefix="advtex-") as folder, suppress(NotFoundError):
+        (path,) = client.download_results(job, Path(folder), names=[name])
+        return path.read_bytes()
+    return None
 
 
 def _submitted(client: Client, batch_id: str, item: BatchItem, on_full: OnFull) -> Outcome:
@@ -145,7 +191,7 @@ def _submit(client: Client, batch_id: str, item: BatchItem) -> JobView:
 
 
 def _spec(batch_id: str, item: BatchItem) -> JobSpec:
-    return job_spec(item.options, item.label, batch_id, item.priority, retention_seconds=item.retention_seconds)
+    return job_spec(item.options, item.label, batch_id, item.priority, item.retention_seconds, item.deadline)
 
 
 def _path(server: str, batch_id: str, folder: Path | None) -> Path:

@@ -16,6 +16,7 @@ from advtex_client._cli import (
     EXIT_CODES,
     ApiKey,
     AsJson,
+    DeadlineOption,
     Folder,
     JobId,
     KeepOption,
@@ -24,6 +25,7 @@ from advtex_client._cli import (
     Seconds,
     Url,
     command,
+    deadline_given,
     exit_code_of,
     job_options,
     retention,
@@ -85,6 +87,7 @@ def submit(
     batch: Annotated[str | None, typer.Option(help="a name of your own for jobs that belong together")] = None,
     priority: PriorityOption = 0,
     keep_days: KeepOption = None,
+    deadline: DeadlineOption = None,
     new: Annotated[bool, typer.Option("--new", help="make another job even if this scan was submitted before")] = False,
     wait: Annotated[bool, typer.Option("--wait", help="follow the job until it ends")] = False,
     output: Folder = None,
@@ -96,7 +99,7 @@ def submit(
     """Check a scan, send it and queue a job. Run again, it goes on with the same job. -o waits and fetches."""
     with command(as_json) as display:
         options = job_options(given)
-        kept = retention(keep_days)
+        kept, due = retention(keep_days), deadline_given(deadline)
         with Client(url, api_key) as client:
             with display.bytes_bar("sending") as bar:
                 job = client.submit(
@@ -106,6 +109,7 @@ def submit(
                     batch=batch,
                     priority=priority,
                     retention_seconds=kept,
+                    deadline=due,
                     new=new,
                     on_bytes=bar.upload,
                 )

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import ExitStack, suppress
+from datetime import datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -25,7 +26,7 @@ from advtex_client.errors import ClientError, NotFoundError
 from advtex_client.submissions import SubmissionMemory, upload_alone
 from advtex_client.uploads import OnBytes, PackedScan, packed
 from advtex_contract.health import KeyView, Readiness
-from advtex_contract.jobs import BatchView, JobSpec, JobState, JobView, ResultFile, UploadView
+from advtex_contract.jobs import BatchLimits, BatchView, JobSpec, JobState, JobView, ResultFile, UploadView
 from advtex_contract.options import JobOptions
 
 T = TypeVar("T")
@@ -105,6 +106,7 @@ class Client:
         batch: str | None = None,
         priority: int = 0,
         retention_seconds: int | None = None,
+        deadline: datetime | None = None,
         new: bool = False,
         on_bytes: OnBytes | None = None,
     ) -> JobView:
@@ -113,9 +115,9 @@ class Client:
         The server checks it once more before it queues the job: `watch_job` and `wait_for_job` tell what came of it.
 
         Raises ScanRejectedError, with every problem found, before anything is sent. `new` makes another job.
-        `retention_seconds`: how long it is kept after its end.
+        `retention_seconds`: how long it is kept after its end. `deadline`: by when it is to end, with a time zone.
         """
-        spec = job_spec(options, label, batch, priority, retention_seconds)
+        spec = job_spec(options, label, batch, priority, retention_seconds, deadline)
         ensure_submittable(scan, spec.options)
         with ExitStack() as stack:
             archive = stack.enter_context(packed(scan))
@@ -191,6 +193,18 @@ class Client:
     def cancel_batch(self, batch_id: str) -> BatchView:
         """Cancel every job of a batch that has not ended."""
         return self._run(calls.cancel_batch(batch_id))
+
+    def pause_batch(self, batch_id: str) -> BatchView:
+        """Keep every job of a batch that waits waiting; what runs goes on."""
+        return self._run(calls.pause_batch(batch_id, True))
+
+    def resume_batch(self, batch_id: str) -> BatchView:
+        """Let the jobs of a paused batch begin again."""
+        return self._run(calls.pause_batch(batch_id, False))
+
+    def limit_batch(self, batch_id: str, max_running: int | None) -> None:
+        """Say how many jobs of a batch run at a time, also before its first one is made; None for any number."""
+        self._run(calls.limit_batch(batch_id, BatchLimits(max_running=max_running)))
 
     def retry_batch(self, batch_id: str) -> BatchView:
         """Queue every failed job of a batch again; each goes on from its newest checkpoint."""

@@ -6,14 +6,17 @@ options    a JSON object of options that differ from those of the command
 preset, method, size, steps ...  each option may have a column of its own too
 priority   larger runs earlier
 keep_days  how long the job is kept after its end
+deadline   by when it is to have ended: an ISO time, of this computer's time zone where it states none
 """
 
 from __future__ import annotations
 
 import csv
 import json
+import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +24,10 @@ from advtex_client.errors import ClientError
 from advtex_contract.options import JobOptions, chosen_options
 from advtex_options import described
 
-COLUMNS = ("path", "label", "options", "priority", "keep_days", *described())
+COLUMNS = ("path", "label", "options", "priority", "keep_days", "deadline", *described())
 FILES = (".zip", ".r3d", ".sens")  # Record3D's files are zips
 SCHEMES = ("file://", "s3://")
+SCANNET_SCENES = "scene[0-9][0-9][0-9][0-9]_[0-9][0-9]"
 
 
 @dataclass(frozen=True)
@@ -36,12 +40,15 @@ class BatchItem:
     options: JobOptions
     priority: int = 0
     retention_seconds: int | None = None
+    deadline: datetime | None = None
 
     @property
     def identity(self) -> tuple[str, ...]:
         """What makes it the same item in a later run."""
         kept = () if self.retention_seconds is None else (f"kept {self.retention_seconds}",)
-        return self.source or str(self.path), self.label, self.options.model_dump_json(), str(self.priority), *kept
+        due = () if self.deadline is None else (f"due {self.deadline.timestamp()}",)
+        given = self.label, self.options.model_dump_json(), str(self.priority)
+        return self.source or str(self.path), *given, *kept, *due
 
 
 def retention_seconds(days: float) -> int:
@@ -51,17 +58,38 @@ def retention_seconds(days: float) -> int:
     return round(days * 86400)
 
 
+def deadline_of(text: str) -> datetime:
+    """Return the time that an ISO text says, of this computer's time zone if it states none. Raises ValueError."""
+    return datetime.fromisoformat(text).astimezone()
+
+
+def read_options(path: Path) -> dict[str, Any]:
+    """Read options by name from a .toml or .json file, as `chosen_options` takes them. Raises ClientError."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        given = tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
+    except (OSError, ValueError) as error:
+        raise ClientError(f"{path} cannot be read: {error}; give a .toml or .json file of options") from error
+    if not isinstance(given, dict):
+        raise ClientError(f'{path} is no JSON object; write {{"preset": "standard", "size": "640x480"}}')
+    if unknown := [name for name in given if name not in described()]:
+        raise ClientError(f"{path}: there is no option {unknown[0]!r}; the options are {', '.join(described())}")
+    return given
+
+
 def read_items(
     place: Path,
     options: JobOptions,
     priority: int = 0,
     by_reference: bool = False,
     retention: int | None = None,
+    deadline: datetime | None = None,
 ) -> list[BatchItem]:
-    """Read the scans of a folder (each folder and zip in it) or of a manifest. Raises ClientError, with the line.
+    """Read the scans of a folder (each folder, zip and .sens in it; of ScanNet's root those in `scans`) or of a
+    manifest. Raises ClientError, with the line.
 
     by_reference: the server reads them at the same path; nothing is sent.
-    options, priority, retention (seconds): of those that say nothing else.
+    options, priority, retention (seconds), deadline: of those that say nothing else.
     """
     found: list[tuple[str, Mapping[str, Any]]]
     try:
@@ -74,7 +102,7 @@ def read_items(
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         remedy = "give a folder of scans, a .csv or a .jsonl file"
         raise ClientError(f"{place} cannot be read: {error}; {remedy}") from error
-    usual = BatchItem(None, None, "", options, priority, retention)
+    usual = BatchItem(None, None, "", options, priority, retention, deadline)
     items = [_item(where, row, base, usual, by_reference) for where, row in found]
     if not items:
         raise ClientError(f"{place} holds no scans; give the folder that holds their folders or zips, or a manifest")
@@ -87,6 +115,9 @@ def read_items(
 
 
 def _scans(folder: Path) -> list[str]:
+    scenes = folder.joinpath("scans").glob(SCANNET_SCENES)
+    if root := sorted(f"scans/{path.name}" for path in scenes if path.is_dir()):
+        return root
     paths = (path for path in folder.iterdir() if not path.name.startswith("."))
     return sorted(path.name for path in paths if path.is_dir() or path.suffix.lower() in FILES)
 
@@ -126,14 +157,15 @@ def _item(where: str, row: Mapping[str, Any], base: Path, usual: BatchItem, by_r
         given = given | {name: row[name] for name in described() if name in row}
         wanted = int(row.get("priority", usual.priority))
         kept = retention_seconds(float(row["keep_days"])) if "keep_days" in row else usual.retention_seconds
+        due = deadline_of(row["deadline"]) if "deadline" in row else usual.deadline
     except (ValueError, TypeError, OverflowError) as error:
-        kinds = "options must be a JSON object, priority and keep_days numbers"
+        kinds = "options must be a JSON object, deadline an ISO time, priority and keep_days numbers"
         raise ClientError(f"{where}: {kinds}: {error}") from error
     try:
         merged = chosen_options(given, usual.options)
     except ValueError as error:
         raise ClientError(f"{where}: {error}") from error
-    item = replace(usual, label=str(label), options=merged, priority=wanted, retention_seconds=kept)
+    item = replace(usual, label=str(label), options=merged, priority=wanted, retention_seconds=kept, deadline=due)
     if name.startswith(SCHEMES):
         return replace(item, source=name)
     path = (base / name).absolute()

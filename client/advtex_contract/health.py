@@ -42,3 +42,4 @@ class KeyView(BaseModel):
     max_active_jobs: int | None = None
     bytes: int
     max_bytes: int | None = None
+    max_running_jobs: int | None = None

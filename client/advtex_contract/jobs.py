@@ -8,7 +8,17 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, computed_field, model_validator
+from pydantic import (
+    AwareDatetime,
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    StringConstraints,
+    computed_field,
+    model_serializer,
+    model_validator,
+)
 
 from advtex_contract.errors import JOB_EXPLANATIONS, ErrorDetail
 from advtex_contract.options import JobOptions
@@ -122,6 +132,14 @@ class JobSpec(BaseModel):
     retention_seconds: int | None = Field(
         default=None, ge=60, description="how long the job is kept after its end; the server's usual time if left out"
     )
+    deadline: AwareDatetime | None = Field(
+        default=None, description="by when it is to have ended: the sooner, the earlier among your jobs of its priority"
+    )
+
+    @model_serializer(mode="wrap")
+    def _without_unset_deadline(self, write: SerializerFunctionWrapHandler):  # type: ignore[no-untyped-def]
+        # no return annotation, as in `GivenOnly`; a server from before deadlines refuses their name
+        return {name: value for name, value in write(self).items() if name != "deadline" or value is not None}
 
     @model_validator(mode="after")
     def _one_scan(self) -> Self:
@@ -186,6 +204,7 @@ class JobView(BaseModel):
     memory_bytes: what a worker must have for it, estimated from its views, texture size and preset once the scan is
     checked.
     retention_seconds: how long it is kept after its end; then `expires_at` is known.
+    late: whether it ended after its deadline, or goes on though that has passed.
     """
 
     id: str
@@ -208,6 +227,8 @@ class JobView(BaseModel):
     finished_at: datetime | None = None
     retention_seconds: int = 0
     expires_at: datetime | None = None
+    deadline: datetime | None = None
+    late: bool = False
 
 
 class JobPage(BaseModel):
@@ -221,6 +242,7 @@ class BatchView(BaseModel):
     """Jobs with a common name.
 
     eta_seconds: until all have ended, at the step rates that were measured; null while nothing was, and in lists.
+    paused: whether its jobs that wait stay waiting. max_running: how many of them run at a time; null for any number.
     """
 
     id: str
@@ -228,8 +250,20 @@ class BatchView(BaseModel):
     states: dict[AnyState, int]
     finished: bool
     eta_seconds: float | None = None
+    paused: bool = False
+    max_running: int | None = None
     created_at: datetime
     updated_at: datetime
+
+
+class BatchLimits(BaseModel):
+    """Body of `PUT /v1/batches/{batch_id}/limits`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    max_running: int | None = Field(
+        default=None, ge=1, le=2**31 - 1, description="how many of its jobs run at a time; any number if left out"
+    )
 
 
 class BatchPage(BaseModel):

@@ -45,10 +45,13 @@ class _Checked(GivenOnly, frozen=True):
     @field_validator("*", mode="wrap")
     @classmethod
     def _refused_in_words(cls, value: object, check: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
+        assert info.field_name is not None
         try:
-            return check(value)
+            checked = check(value)
+            if checked is not None and (words := _malformed(info.field_name, checked)) is not None:
+                raise PydanticCustomError("form", "{words}", {"words": words})
+            return checked
         except ValidationError as error:
-            assert info.field_name is not None
             if (words := refusal(info.field_name, value)) is None:
                 raise
             raise PydanticCustomError(error.errors()[0]["type"], "{words}", {"words": words}) from error
@@ -77,12 +80,18 @@ def _described_fields() -> dict[str, Any]:
         if name in _NARROWER:
             default = kind(default)
         words = about.help if default is not None else f"{about.help}; left out: {about.unset}"
-        longest = 40 if kind in (str, str | None) else None
+        longest = (200 if about.form else 40) if kind in (str, str | None) else None
         offer = partial(_offer, about.choices) if kind is str and about.choices is not None else None
         told: dict[str, Any] = {"description": words, "json_schema_extra": offer}
         field = Field(default=default, ge=about.low, le=about.high, max_length=longest, **told)
         made[name] = (kind, field)
     return made
+
+
+def _malformed(name: str, value: object) -> str | None:
+    """What is wrong with a text that has a form, in words; None for all else."""
+    about = described().get(name)
+    return refusal(name, value) if about is not None and about.parse is not None else None
 
 
 def _offer(choices: Mapping[str, str], schema: dict[str, Any]) -> None:

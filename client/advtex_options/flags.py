@@ -51,7 +51,7 @@ def flag(name: str, **more: Any) -> Any:
         words.append("; ".join(f"{word}: {help_}" if help_ else word for word, help_ in about.choices.items()))
     if about.bounds:
         words.append(about.bounds)
-    metavar = "WxH" if name == "size" else "NAME" if about.choices is not None else "N"
+    metavar = about.form or ("WxH" if name == "size" else "NAME" if about.choices is not None else "N")
     more |= {} if kind_of(name) is bool else {"metavar": metavar}
     return typer.Option(f"--{name.replace('_', '-')}", help=". ".join(words), show_default=about.unset, **more)
 

@@ -9,16 +9,24 @@ API.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache
 from types import MappingProxyType
 from typing import Any, TypeVar, get_type_hints
 
+from advtex_options.box import FORM, parse_box
 from advtex_options.methods import METHOD_HELP
 from advtex_options.words import PRESET_HELP, Preset
 from advtex_scan.layouts import LAYOUT_NAMES
 
+UNSEEN_HELP = MappingProxyType(
+    {
+        "guess": "it has the tone of its surroundings",
+        "gray": "it is gray",
+        "remove": "its faces are left out of the model",
+    }
+)
 FACE_BUDGET = 80_000
 MAX_VIEWS = 240
 
@@ -32,6 +40,7 @@ class Described:
     help: a phrase. label: the page's name for it. low, high: bounds, both included, of what is a number; `unit` says
     of what. choices: the words that it may be, with their help where they have one; `others` says how there come to be
     more. unset: what happens without it.
+    form: of a text, what it looks like; `parse` reads it, and raises ValueError, in a sentence, for what it is not.
     offers: values among which the page lets choose, with what it calls them; `offered` is chosen there to begin with.
     """
 
@@ -45,6 +54,8 @@ class Described:
     others: str = ""
     offers: tuple[tuple[str, str], ...] = ()
     offered: str = ""
+    form: str = ""
+    parse: Callable[[object], object] | None = None
 
     @property
     def bounds(self) -> str:
@@ -127,6 +138,31 @@ class Options:
         "Lossless images",
         unset="no, they are JPEG in all but the OBJ",
     )
+    unseen: str | None = option(
+        None,
+        "what becomes of the surface that no photograph shows, nor one beside it",
+        "Never seen",
+        unset="guess",
+        choices=UNSEEN_HELP,
+    )
+    close_holes: float | None = option(
+        None,
+        "close holes of the mesh whose border is no longer than this; what closes them counts as unseen",
+        "Close holes",
+        unset="holes stay open",
+        low=0.001,
+        high=1000,
+        unit="metres",
+    )
+    box: str | None = option(
+        None,
+        "keep only what lies in this box: its center and size in metres of the scan's world, and its turn about the "
+        "up axis in degrees, counter-clockwise from above",
+        "Box",
+        unset="the whole scan is kept",
+        form=FORM,
+        parse=parse_box,
+    )
 
 
 SIZE = Described(
@@ -167,6 +203,12 @@ def refusal(name: str, value: object) -> str | None:
     if about.choices is not None:
         known = isinstance(value, str) and value in about.choices
         return None if known else f"{name} {shown} is unknown; choose one of {', '.join(about.choices)}{unset}"
+    if about.parse is not None:
+        try:
+            about.parse(value)
+        except ValueError as error:
+            return f"{error}{unset}"
+        return None
     kind = int if name in sides else kind_of(name)
     if kind is bool and not isinstance(value, bool):
         return f"{name} {shown} is neither true nor false; give one of them{unset}"

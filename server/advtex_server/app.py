@@ -1,10 +1,10 @@
-"""The application: routes around one `Service`, with dispatcher and checker beside them."""
+"""The application: routes around one `Service`, with what runs in the background beside them."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from contextlib import AsyncExitStack, asynccontextmanager
 
 from fastapi import FastAPI
 
@@ -13,11 +13,10 @@ from advtex_scan.version import product_version
 from advtex_server import errors
 from advtex_server.access import AccessMiddleware
 from advtex_server.authentication import Authenticator
+from advtex_server.background import Background
 from advtex_server.bodies import OpenBodies
 from advtex_server.browsers import BrowserHeadersMiddleware, BrowserSessions
-from advtex_server.checking import Checker
-from advtex_server.deliveries import Deliverer
-from advtex_server.dispatch import Dispatcher
+from advtex_server.deliveries import rules
 from advtex_server.events import Lookout
 from advtex_server.intake import Intake
 from advtex_server.metrics import Metrics, MetricsMiddleware
@@ -34,37 +33,32 @@ from advtex_store.store import open_store
 from advtex_store.tracing import open_traces
 
 
-def create_app(settings: ServerSettings) -> FastAPI:
+def create_app(settings: ServerSettings, *, dispatch: bool = True) -> FastAPI:
     """Nothing is contacted before the application starts; then the schema is brought up to date.
 
+    dispatch: whether it does what is to be done in the background; else another process has to.
     `app.state.stopping` is set by whoever stops the server, so that open event streams end at once.
     """
     store = open_store(settings)
     traces = open_traces("advtex-server")
     metrics = Metrics(store, settings.metrics_owners if settings.metrics_guarded else 0)
-    dispatcher = Dispatcher(store, settings, metrics.round, traces)
-    checker = Checker(store, settings, dispatcher.wake, traces)
-    deliverer = Deliverer(store.webhooks, settings, metrics.delivered, traces)
+    background = Background(store, settings, metrics, traces) if dispatch else None
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         await asyncio.to_thread(upgrade_database, settings.database)
         known_methods()  # the log says at once which ones of other packages cannot be used
-        tasks = [asyncio.create_task(dispatcher.run()), asyncio.create_task(deliverer.run())]
-        checker.start()
-        yield
-        app.state.stopping.set()
-        for task in tasks:
-            task.cancel()
-            with suppress(asyncio.CancelledError):
-                await task
-        await asyncio.to_thread(checker.stop)
-        await asyncio.to_thread(traces.close)
+        async with AsyncExitStack() as stack:
+            stack.push_async_callback(asyncio.to_thread, traces.close)
+            if background is not None:
+                await stack.enter_async_context(background.running())
+            yield
+            app.state.stopping.set()
         store.close()
 
     def wake() -> None:
-        checker.wake()
-        dispatcher.wake()
+        if background is not None:
+            background.wake()
 
     app = FastAPI(
         title="advtex",
@@ -76,7 +70,7 @@ def create_app(settings: ServerSettings) -> FastAPI:
         redoc_url=None,
     )
     app.state.service = Service(store, settings, wake, traces)
-    app.state.webhooks = WebhookService(store.webhooks, deliverer.rules)
+    app.state.webhooks = WebhookService(store.webhooks, rules(settings))
     app.state.stopping = asyncio.Event()
     app.state.intake = Intake(store, settings, traces)
     app.state.bodies = OpenBodies()

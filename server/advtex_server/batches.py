@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 
 import structlog
 
-from advtex_contract.jobs import TERMINAL, BatchPage, BatchView, JobState
+from advtex_contract.jobs import TERMINAL, BatchLimits, BatchPage, BatchView, JobState
 from advtex_server.older_clients import told_batch
 from advtex_store.accounts import Caller
 from advtex_store.batches import BatchSummary
@@ -40,6 +40,17 @@ class BatchService:
         log.info("cancel asked", batch=batch_id)
         return self.view(owner, batch_id)
 
+    def pause(self, owner: str, batch_id: str, paused: bool) -> BatchView:
+        self.store.batches.pause(owner, batch_id, paused)
+        log.info("paused" if paused else "resumed", batch=batch_id)
+        self.wake()
+        return self.view(owner, batch_id)
+
+    def limit(self, owner: str, batch_id: str, limits: BatchLimits) -> None:
+        self.store.batches.limit(owner, batch_id, limits.max_running)
+        log.info("limited", batch=batch_id, max_running=limits.max_running)
+        self.wake()
+
     def retry_failed(self, caller: Caller, batch_id: str) -> BatchView:
         self.store.batches.batch(caller.owner, batch_id)
         for job_id in self.store.batches.jobs(caller.owner, batch_id, {JobState.failed}):
@@ -58,6 +69,8 @@ def batch_view(batch: BatchSummary) -> BatchView:
         states=dict(batch.states),
         finished=batch.finished,
         eta_seconds=batch.eta_seconds,
+        paused=batch.paused,
+        max_running=batch.max_running,
         created_at=datetime.fromtimestamp(batch.created_at, UTC),
         updated_at=datetime.fromtimestamp(batch.updated_at, UTC),
     )

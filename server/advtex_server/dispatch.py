@@ -20,7 +20,7 @@ from advtex_contract.jobs import JobState
 from advtex_server.settings import ServerSettings
 from advtex_store.errors import StaleAttempt, StoreError
 from advtex_store.fair_queue import WaitingJob
-from advtex_store.queue import WorkerClass, rq_id
+from advtex_store.queue import WorkerClass, attempt_of, rq_id
 from advtex_store.retention import Retention
 from advtex_store.store import Store
 from advtex_store.tracing import OFF, Traces
@@ -54,8 +54,17 @@ class Held:
         return name in self._declined or any(name in names for names in self._by_class.values())
 
     @property
+    def jobs(self) -> set[str]:
+        """Ids of those that wait there."""
+        return {attempt_of(name)[0] for names in self._by_class.values() for name in names}
+
+    @property
     def total(self) -> int:
         return len(self._declined) + sum(map(len, self._by_class.values()))
+
+    def names(self, of: WorkerClass) -> frozenset[str]:
+        """Those that wait for a class."""
+        return frozenset(self._by_class[of.gib])
 
     def waiting(self, found: WorkerClass) -> int:
         """How many wait for a class."""
@@ -137,6 +146,7 @@ class Dispatcher:
             held = Held(queue.waiting_by_class([found.gib for found in classes]), queue.declined())
             before = held.total
             self._take_back(classes, held)
+            self._take_back_paused(classes, held)
             for found in classes:
                 self._offer(found, found.idle - held.waiting(found), held)
             for found in classes:
@@ -158,18 +168,25 @@ class Dispatcher:
             if behind > 0:
                 held.remove(found, self.store.queue.take_back(found.gib, behind))
 
+    def _take_back_paused(self, classes: Sequence[WorkerClass], held: Held) -> None:
+        """What was offered before its batch was paused."""
+        paused = self.store.records.paused(held.jobs)
+        for found in classes if paused else ():
+            names = [name for name in held.names(found) if attempt_of(name)[0] in paused]
+            held.remove(found, self.store.queue.take_away(found.gib, names))
+
     def _offer(self, to: WorkerClass, room: int, held: Held) -> None:
         """The next attempts to one class, as far as there is room."""
         if room <= 0:
             return
-        for job in self.store.records.waiting(room + held.total, to.memory_bytes):
+        for job in self.store.records.waiting(room + held.total, to.memory_bytes, held.jobs):
             room -= self._offer_job(job, to, held)
             if room == 0:
                 return
 
     def _offer_preempted(self, to: WorkerClass, held: Held) -> None:
         """What had to give its worker back is not kept waiting for room."""
-        for job in self.store.records.waiting(1 + held.total, to.memory_bytes):
+        for job in self.store.records.waiting(1 + held.total, to.memory_bytes, held.jobs):
             if job.state == JobState.preempted:
                 self._offer_job(job, to, held)
 
@@ -210,6 +227,7 @@ class Dispatcher:
         self.retention.expire()
         self.retention.purge()
         self.retention.tidy()
+        self.store.batches.forget()
         if dropped := self.store.webhooks.drop_old():
             log.warning("webhook deliveries given up", count=dropped)
         if time.monotonic() >= self._next_sweep:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -18,6 +18,7 @@ from advtex_options.flags import version_flag
 from advtex_server.embedded import SetupError
 from advtex_server.fleet import look_at_fleet
 from advtex_server.health import checks
+from advtex_server.serving import dispatch as run_dispatcher
 from advtex_server.serving import serve as run_server
 from advtex_server.serving import up as run_all
 from advtex_server.settings import ServerSettings
@@ -54,6 +55,9 @@ Port = Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one")]
 MaxActiveJobs = Annotated[
     int | None, typer.Option(min=0, max=2**31 - 1, help="jobs of its owner that have not ended, at most")
 ]
+MaxRunningJobs = Annotated[
+    int | None, typer.Option(min=1, max=2**31 - 1, help="jobs of its owner that run at a time, at most")
+]
 MaxBytes = Annotated[int | None, typer.Option(min=0, max=2**63 - 1, help="bytes of its owner's uploads, at most")]
 
 
@@ -66,14 +70,31 @@ def up(
     """Run everything on this machine: API, Redis, database and one worker."""
     configure_logs()
     settings = ServerSettings() if data_dir is None else ServerSettings(data_dir=data_dir)
-    _guarded(run_all, settings, host, port)
+    with _told(SetupError, SchemaRefused):
+        run_all(settings, host, port)
 
 
 @app.command()
-def serve(host: Host = "0.0.0.0", port: Port = 8000) -> None:  # noqa: S104  a server in a container
+def serve(
+    host: Host = "0.0.0.0",  # noqa: S104  a server in a container
+    port: Port = 8000,
+    dispatch: Annotated[
+        bool,
+        typer.Option("--dispatch/--no-dispatch", help="whether it dispatches too, or `advtex-server dispatch` does"),
+    ] = True,
+) -> None:
     """Run the API alone; workers, Redis and database are elsewhere."""
     configure_logs()
-    _guarded(run_server, ServerSettings(), host, port)
+    with _told(SetupError, SchemaRefused):
+        run_server(ServerSettings(), host, port, dispatch=dispatch)
+
+
+@app.command()
+def dispatch() -> None:
+    """Run what servers with --no-dispatch leave: hand out jobs, put right, check scans, deliver webhooks."""
+    configure_logs()
+    with _told(SchemaRefused):
+        run_dispatcher(ServerSettings())
 
 
 @app.command()
@@ -127,6 +148,7 @@ def create_key(
     days: Annotated[int | None, typer.Option(min=1, help="until the key expires")] = None,
     max_active_jobs: MaxActiveJobs = None,
     max_bytes: MaxBytes = None,
+    max_running_jobs: MaxRunningJobs = None,
 ) -> None:
     """Make a key and print it: it cannot be shown again."""
     expires = None if days is None else (datetime.now(UTC) + timedelta(days=days)).timestamp()
@@ -138,6 +160,7 @@ def create_key(
             expires_at=expires,
             max_active_jobs=max_active_jobs,
             max_bytes=max_bytes,
+            max_running_jobs=max_running_jobs,
         )
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
@@ -161,6 +184,7 @@ def list_keys() -> None:
                     "max_active_jobs": row.max_active_jobs,
                     "bytes": usage.bytes,
                     "max_bytes": row.max_bytes,
+                    "max_running_jobs": row.max_running_jobs,
                     "created_at": row.created_at,
                     "expires_at": row.expires_at,
                     "revoked_at": row.revoked_at,
@@ -187,10 +211,15 @@ def rotate_key(
 
 
 @keys.command("limit")
-def limit_key(key_id: str, max_active_jobs: MaxActiveJobs = None, max_bytes: MaxBytes = None) -> None:
-    """Set both limits of a key; what is left out is not limited."""
+def limit_key(
+    key_id: str,
+    max_active_jobs: MaxActiveJobs = None,
+    max_bytes: MaxBytes = None,
+    max_running_jobs: MaxRunningJobs = None,
+) -> None:
+    """Set all limits of a key; what is left out is not limited."""
     with _told(RecordNotFound):
-        _accounts().set_quota(key_id, max_active_jobs, max_bytes)
+        _accounts().set_quota(key_id, max_active_jobs, max_bytes, max_running_jobs)
 
 
 def main() -> None:
@@ -235,13 +264,6 @@ def _told(*errors: type[Exception]) -> Iterator[None]:
     except errors as error:
         typer.echo(f"advtex-server: {error}", err=True)
         raise typer.Exit(1) from None
-
-
-def _guarded(
-    command: Callable[[ServerSettings, str, int], None], settings: ServerSettings, host: str, port: int
-) -> None:
-    with _told(SetupError, SchemaRefused):
-        command(settings, host, port)
 
 
 if __name__ == "__main__":

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
-from typing import cast
 
-from fastapi import FastAPI
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
@@ -54,8 +52,7 @@ class MetricsAccess:
         return Response(body, media_type=media_type)
 
 
-def metrics_app(app: FastAPI) -> Starlette:
-    """What listens at the port of the metrics, beside `app` in one process."""
-    access = cast(MetricsAccess, app.state.metrics_access)
+def metrics_app(access: MetricsAccess) -> Starlette:
+    """What listens at the port of the metrics, beside the API or a dispatcher in one process."""
     endpoint: Callable[[Request], Awaitable[Response]] = access.at_their_port
     return Starlette(routes=[Route(PATH, endpoint)])

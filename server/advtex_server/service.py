@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from urllib.parse import quote
 
@@ -40,6 +41,7 @@ from advtex_store.tracing import OFF, Traces
 
 IN_CHECK = "its scan is being checked"
 IN_LINE = "a worker takes it when its turn comes"
+PAUSED = "its batch is paused; it waits until the batch is resumed"
 REASONS: Mapping[str, str] = {JobState.checking: IN_CHECK, **dict.fromkeys(WAITING, IN_LINE)}  # the usual ones
 
 log = structlog.get_logger("advtex.server")
@@ -78,6 +80,7 @@ class Service:
             max_active_jobs=caller.max_active_jobs,
             bytes=usage.bytes,
             max_bytes=caller.max_bytes,
+            max_running_jobs=caller.max_running_jobs,
         )
 
     # -- jobs -----------------------------------------------------------------------------------------------------
@@ -121,11 +124,13 @@ class Service:
         """The row with the progress of this moment."""
         row = self.store.records.job(job_id, owner)
         self.store.live_progress.show([row])
+        self._tell_of_pauses(owner, [row])
         return row
 
     def jobs(self, owner: str, wanted: JobFilter, cursor: str | None, limit: int) -> JobPage:
         rows, following = self.store.submissions.list_jobs(owner, wanted, cursor=cursor, limit=limit)
         self.store.live_progress.show(rows)
+        self._tell_of_pauses(owner, rows)
         return JobPage(jobs=[told(job_view(row)) for row in rows], next_cursor=following)
 
     def cancel(self, owner: str, job_id: str) -> JobView:
@@ -175,6 +180,14 @@ class Service:
         raise ApiError(ErrorCode.not_found, f"job {job_id} has no live picture {name!r} now")
 
     # -- inside ---------------------------------------------------------------------------------------------------
+
+    def _tell_of_pauses(self, owner: str, rows: Sequence[JobRow]) -> None:
+        """Why jobs of paused batches wait. No row says so: it would have to be told to each that comes to wait."""
+        waiting = [row for row in rows if row.batch is not None and row.state in WAITING]
+        paused = self.store.batches.paused(owner) if waiting else ()
+        for row in waiting:
+            if row.batch in paused:
+                row.waiting_reason = PAUSED
 
     def _live_record(self, owner: str, job_id: str) -> LiveRecord | None:
         row = self.store.records.job(job_id, owner)
@@ -233,6 +246,8 @@ def job_view(row: JobRow) -> JobView:
         finished_at=_time(row.finished_at) if row.finished_at else None,
         retention_seconds=row.retention_seconds,
         expires_at=_time(row.expires_at) if row.expires_at else None,
+        deadline=_time(row.deadline) if row.deadline is not None else None,
+        late=row.deadline is not None and (row.finished_at or time.time()) > row.deadline,
     )
 
 

@@ -1,4 +1,5 @@
-"""Running the application: alone (`serve`), or with its Redis and one worker (`up`)."""
+"""Running the application: alone (`serve`), its background alone (`dispatch`), or both with a Redis and one worker
+(`up`)."""
 
 from __future__ import annotations
 
@@ -13,18 +14,23 @@ import sys
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 
 import uvicorn
-from fastapi import FastAPI
 from starlette.types import ASGIApp
 
+from advtex_options.methods import known_methods
 from advtex_server.app import create_app
+from advtex_server.authentication import Authenticator
+from advtex_server.background import Background
 from advtex_server.embedded import EmbeddedRedis, SetupError, client_key, only_one
-from advtex_server.metrics_access import metrics_app
+from advtex_server.metrics import Metrics
+from advtex_server.metrics_access import MetricsAccess, metrics_app
 from advtex_server.settings import ServerSettings
 from advtex_store.accounts import Accounts, key_id
 from advtex_store.database import Database, upgrade_database
 from advtex_store.secrecy import hide_environment
 from advtex_store.sessions import Sessions
+from advtex_store.store import open_store
 from advtex_store.supervision import Supervised
+from advtex_store.tracing import open_traces
 
 WORKER_STOP_SECONDS = 60.0  # a worker writes its checkpoint in this time
 WATCH_SECONDS = 0.5
@@ -38,11 +44,32 @@ class _Server(uvicorn.Server):
         yield
 
 
-def serve(settings: ServerSettings, host: str, port: int) -> None:
-    """The API with its dispatcher, until a signal comes. SetupError, SchemaRefused."""
+def serve(settings: ServerSettings, host: str, port: int, *, dispatch: bool = True) -> None:
+    """The API, with its dispatcher or without, until a signal comes. SetupError, SchemaRefused."""
     upgrade_database(settings.database)
     with _listen(host, port) as listener:
-        run(settings, listener, [], lambda: _say_ready(settings, _url(listener)))
+        run(settings, listener, [], lambda: _say_ready(settings, _url(listener)), dispatch=dispatch)
+
+
+def dispatch(settings: ServerSettings) -> None:
+    """The background alone, until SIGTERM or SIGINT. SchemaRefused."""
+    upgrade_database(settings.database)
+    asyncio.run(_dispatch(settings))
+
+
+async def _dispatch(settings: ServerSettings) -> None:
+    known_methods()  # the log says at once which ones of other packages cannot be used
+    stopping = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, stopping.set)
+    store, traces = open_store(settings), open_traces("advtex-dispatcher")
+    metrics = Metrics(store, settings.metrics_owners)
+    access = MetricsAccess(metrics, Authenticator(store.accounts, settings.auth_failures_per_minute), settings)
+    async with _metrics(access, settings, "0.0.0.0"), Background(store, settings, metrics, traces).running():  # noqa: S104
+        print(json.dumps({"event": "ready", "pid": os.getpid()}), flush=True)
+        await stopping.wait()
+    await asyncio.to_thread(traces.close)
+    store.close()
 
 
 def up(settings: ServerSettings, host: str, port: int) -> None:
@@ -80,16 +107,25 @@ def up(settings: ServerSettings, host: str, port: int) -> None:
 
 
 def run(
-    settings: ServerSettings, listener: socket.socket, children: Sequence[Supervised], ready: Callable[[], None]
+    settings: ServerSettings,
+    listener: socket.socket,
+    children: Sequence[Supervised],
+    ready: Callable[[], None],
+    *,
+    dispatch: bool = True,
 ) -> None:
     """Serve until SIGTERM or SIGINT; then stop the API and the children, the last one first."""
-    asyncio.run(_run(settings, listener, children, ready))
+    asyncio.run(_run(settings, listener, children, ready, dispatch))
 
 
 async def _run(
-    settings: ServerSettings, listener: socket.socket, children: Sequence[Supervised], ready: Callable[[], None]
+    settings: ServerSettings,
+    listener: socket.socket,
+    children: Sequence[Supervised],
+    ready: Callable[[], None],
+    dispatch: bool,
 ) -> None:
-    app = create_app(settings)
+    app = create_app(settings, dispatch=dispatch)
     # What was made so far lives as long as the process: looked through by every full collection, it stops all answers
     # for a tenth of a second.
     gc.collect()
@@ -108,7 +144,7 @@ async def _run(
         loop.add_signal_handler(number, stop)
     watcher = asyncio.create_task(_watch(server, children, ready))
     try:
-        async with _metrics(app, settings, listener.getsockname()[0]):
+        async with _metrics(app.state.metrics_access, settings, listener.getsockname()[0]):
             await server.serve(sockets=[listener])
     finally:
         watcher.cancel()
@@ -129,13 +165,13 @@ def _server(app: ASGIApp, settings: ServerSettings) -> _Server:
 
 
 @contextlib.asynccontextmanager
-async def _metrics(app: FastAPI, settings: ServerSettings, host: str) -> AsyncIterator[None]:
+async def _metrics(access: MetricsAccess, settings: ServerSettings, host: str) -> AsyncIterator[None]:
     """Serve the metrics at a port of their own, if they have one. SetupError."""
     if settings.metrics_port is None:
         yield
         return
     with _listen(host, settings.metrics_port) as listener:
-        server = _server(metrics_app(app), settings)
+        server = _server(metrics_app(access), settings)
         serving = asyncio.create_task(server.serve(sockets=[listener]))
         try:
             yield

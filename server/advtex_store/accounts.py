@@ -33,6 +33,7 @@ class Caller:
     max_active_jobs: int | None = None
     max_bytes: int | None = None
     expires_at: float | None = None
+    max_running_jobs: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +59,7 @@ class Accounts:
         expires_at: float | None = None,
         max_active_jobs: int | None = None,
         max_bytes: int | None = None,
+        max_running_jobs: int | None = None,
     ) -> str:
         """Make a key; the only time that its secret can be seen. Without an owner, it is an owner of its own."""
         if unknown := set(scopes) - set(SCOPES):
@@ -76,6 +78,7 @@ class Accounts:
                     scopes=sorted(scopes),
                     max_active_jobs=max_active_jobs,
                     max_bytes=max_bytes,
+                    max_running_jobs=max_running_jobs,
                     created_at=self.database.now(session),
                     expires_at=expires_at,
                 )
@@ -108,6 +111,7 @@ class Accounts:
             expires_at=row.expires_at,
             max_active_jobs=row.max_active_jobs,
             max_bytes=row.max_bytes,
+            max_running_jobs=row.max_running_jobs,
         )
         with self.database.write() as session:
             old = session.get_one(ApiKeyRow, key_id)
@@ -115,13 +119,16 @@ class Accounts:
             old.expires_at = end if old.expires_at is None else min(old.expires_at, end)
         return key
 
-    def set_quota(self, key_id: str, max_active_jobs: int | None, max_bytes: int | None) -> None:
-        """Replace both limits; None for none."""
+    def set_quota(
+        self, key_id: str, max_active_jobs: int | None, max_bytes: int | None, max_running_jobs: int | None = None
+    ) -> None:
+        """Replace all three limits; None for none."""
         with self.database.write() as session:
             row = session.get(ApiKeyRow, key_id)
             if row is None:
                 raise RecordNotFound(f"there is no key {key_id}")
             row.max_active_jobs, row.max_bytes = max_active_jobs, max_bytes
+            row.max_running_jobs = max_running_jobs
 
     def usage(self, owner: str) -> Usage:
         """What counts towards the quotas."""
@@ -155,7 +162,8 @@ def caller_of(row: ApiKeyRow | None, now: float) -> Caller | None:
     if row is None or row.revoked_at is not None or (row.expires_at is not None and row.expires_at <= now):
         return None
     scopes = frozenset(row.scopes)
-    return Caller(row.id, row.owner, scopes, row.max_active_jobs, row.max_bytes, row.expires_at)
+    limits = row.max_active_jobs, row.max_bytes, row.expires_at, row.max_running_jobs
+    return Caller(row.id, row.owner, scopes, *limits)
 
 
 def lock_owner(session: Session, owner: str) -> None:

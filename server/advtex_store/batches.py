@@ -1,4 +1,4 @@
-"""Batches: jobs that a client gave the same name. They have no row of their own."""
+"""Batches: jobs that a client gave the same name, and what was said of them as a whole."""
 
 from __future__ import annotations
 
@@ -8,25 +8,33 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from sqlalchemy import Select, func, select
+from sqlalchemy import Select, delete, exists, func, select
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.orm import Session
 
 from advtex_contract.jobs import PENDING, TERMINAL, JobState, Progress
 from advtex_store.database import Database
 from advtex_store.errors import RecordNotFound
-from advtex_store.models import JobRow
+from advtex_store.models import BatchRow, JobRow
 
+UNUSED_SECONDS = 3600.0  # what was said of a batch before its first job is kept this long
 MEASURED = 200  # of the ended jobs, the newest ones tell how long one takes
 
 
 @dataclass(frozen=True, slots=True)
 class BatchSummary:
-    """Counts by state, and the seconds that are left, None if nothing was measured yet."""
+    """Counts by state, and the seconds that are left, None if nothing was measured yet.
+
+    max_running: how many of its jobs run at a time; None for any number.
+    """
 
     id: str
     states: Mapping[str, int]
     created_at: float
     updated_at: float
     eta_seconds: float | None = None
+    paused: bool = False
+    max_running: int | None = None
 
     @property
     def finished(self) -> bool:
@@ -56,6 +64,7 @@ class Batches:
             states, first, last = self._counts(session.execute(_counted(owner).where(JobRow.batch == batch_id)).all())
             if not states:
                 raise RecordNotFound(f"there is no batch {batch_id}")
+            said = _said(session, owner, [batch_id])
             mine = select(JobRow.options, JobRow.progress).where(
                 JobRow.owner == owner, JobRow.batch == batch_id, JobRow.deleted_at.is_(None)
             )
@@ -69,7 +78,7 @@ class Batches:
             [(o, Progress.model_validate(p)) for o, p in running],
             waiting,
         )
-        return BatchSummary(batch_id, states, first, last, eta)
+        return BatchSummary(batch_id, states, first, last, eta, **said[batch_id])
 
     def batches(self, owner: str, cursor: str | None, limit: int) -> tuple[list[BatchSummary], str | None]:
         """A page, newest first, and the cursor of the next one. Without the time that is left."""
@@ -84,19 +93,51 @@ class Batches:
             page = session.execute(newest.order_by(func.min(JobRow.id).desc()).limit(limit + 1)).all()
             names = [name for name, _ in page[:limit] if name is not None]
             counted = session.execute(_counted(owner).where(JobRow.batch.in_(names))).all()
+            said = _said(session, owner, names)
         rows = {name: [row for row in counted if row[0] == name] for name in names}
-        found = [BatchSummary(name, *self._counts(rows[name])) for name in names]
+        found = [BatchSummary(name, *self._counts(rows[name]), **said[name]) for name in names]
         return found, page[limit - 1][1] if len(page) > limit else None
+
+    def pause(self, owner: str, batch_id: str, paused: bool) -> None:
+        """From now on none of its jobs begins, or all may again; what runs goes on. RecordNotFound."""
+        with self.database.write() as session:
+            if session.scalar(_kept(owner, batch_id).limit(1)) is None:
+                raise RecordNotFound(f"there is no batch {batch_id}")
+            now = self.database.now(session)
+            self._say(session, owner, batch_id, {"paused_at": now if paused else None})
+
+    def limit(self, owner: str, batch_id: str, max_running: int | None) -> None:
+        """How many of its jobs run at a time, also of one that is yet to come; None for any number."""
+        with self.database.write() as session:
+            self._say(session, owner, batch_id, {"max_running": max_running})
+
+    def paused(self, owner: str) -> frozenset[str]:
+        """The names of those that are paused."""
+        with self.database.read() as session:
+            query = select(BatchRow.id).where(BatchRow.owner == owner, BatchRow.paused_at.is_not(None))
+            return frozenset(session.scalars(query))
+
+    def forget(self) -> None:
+        """Drop what was said of batches that have no jobs any more."""
+        jobs = exists().where(JobRow.owner == BatchRow.owner, JobRow.batch == BatchRow.id, JobRow.deleted_at.is_(None))
+        with self.database.read() as session:
+            aged = BatchRow.updated_at < self.database.now(session) - UNUSED_SECONDS
+            found = session.execute(select(BatchRow.owner, BatchRow.id).where(aged, ~jobs)).all()
+        for owner, batch_id in found:
+            with self.database.write() as session:
+                where = (BatchRow.owner == owner, BatchRow.id == batch_id)
+                session.execute(delete(BatchRow).where(*where, aged, ~jobs))
+
+    def _say(self, session: Session, owner: str, batch_id: str, values: Mapping[str, Any]) -> None:
+        insert = sqlite.insert if session.get_bind().dialect.name == "sqlite" else postgresql.insert
+        told = {**values, "updated_at": self.database.now(session)}
+        inserted = insert(BatchRow).values(owner=owner, id=batch_id, **told)
+        session.execute(inserted.on_conflict_do_update(index_elements=["owner", "id"], set_=told))
 
     def jobs(self, owner: str, batch_id: str, states: Iterable[JobState]) -> list[str]:
         """Ids of the batch's jobs in these states, oldest first."""
         with self.database.read() as session:
-            query = select(JobRow.id).where(
-                JobRow.owner == owner,
-                JobRow.batch == batch_id,
-                JobRow.state.in_(list(states)),
-                JobRow.deleted_at.is_(None),
-            )
+            query = _kept(owner, batch_id).where(JobRow.state.in_(list(states)))
             return list(session.scalars(query.order_by(JobRow.id)))
 
     @staticmethod
@@ -147,6 +188,18 @@ def _whole_seconds(progress: Progress) -> float | None:
     if not progress.steps_per_second or progress.eta_seconds is None:
         return None
     return sum(progress.stage_seconds.values()) + progress.eta_seconds
+
+
+def _kept(owner: str, batch_id: str) -> Select[str]:
+    """Ids of the batch's jobs."""
+    return select(JobRow.id).where(JobRow.owner == owner, JobRow.batch == batch_id, JobRow.deleted_at.is_(None))
+
+
+def _said(session: Session, owner: str, names: Sequence[str]) -> Mapping[str, dict[str, Any]]:
+    """Name -> the fields of its summary that its row tells."""
+    rows = session.scalars(select(BatchRow).where(BatchRow.owner == owner, BatchRow.id.in_(names)))
+    said = {row.id: {"paused": row.paused_at is not None, "max_running": row.max_running} for row in rows}
+    return {name: said.get(name, {}) for name in names}
 
 
 def _kind(options: Mapping[str, Any]) -> str:

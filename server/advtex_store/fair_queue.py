@@ -1,26 +1,30 @@
-"""Whose job is next: fair queueing by owner.
+"""Whose job is next: owners take turns, and the batches of each owner do.
 
-Waiting rows of one owner that need the same memory are a line, and the index `ix_jobs_line` holds every line in order.
-A look at who is next costs a probe per line and what is taken from them, however many rows wait behind those.
+Waiting rows of one owner, batch and priority that need the same memory are a line, and the index `ix_jobs_turn` holds
+every line in order. A look at who is next costs a probe per line and what is taken from them, however many rows wait
+behind those.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from heapq import merge
+from heapq import heapify, heappop, heappush, merge
 from itertools import islice
+from math import inf
 from typing import Any, NamedTuple
 
 from sqlalchemy import CTE, JSON, ColumnElement, Select, TextClause, func, select, text
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from advtex_contract.jobs import JobState
-from advtex_store.models import KEPT, WAITS_IN_LINE, JobRow
+from advtex_store.lines import Allowance, Line, read_holds
+from advtex_store.models import KEPT, WAITS_FOR_ITS_TURN, JobRow
 
 FIRST_DEPTH = 8  # rows that are read of every line at first
+AGING_SECONDS = 3600.0  # of waiting for which a batch that has nothing running counts as one step of priority more
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,31 +37,44 @@ class WaitingJob:
 
 
 class _Place(NamedTuple):
-    """A row in its line; compares as the line is ordered: preempted ones first, then by priority, then the older."""
+    """A row in its line; compares as the line is ordered: preempted ones first, then what is due, then the older.
+
+    due, deadline, made: seconds since 1970.
+    """
 
     state: str
-    urgency: int  # the less, the earlier: minus the priority
+    due: float
     id: str
     attempt: int
+    deadline: float | None
+    made: float
 
 
 class _Cut(Exception):
     """The part of a line that was read has been used up."""
 
 
-def next_jobs(session: Session, limit: int, gib: int | None = None) -> list[WaitingJob]:
+def next_jobs(
+    session: Session, limit: int, now: float, gib: int | None = None, offered: Collection[str] = ()
+) -> list[WaitingJob]:
     """The waiting jobs that come next, of those that a worker of the class `gib` can take; None for any.
 
-    Preempted ones first. Then owners take turns, those first who have the fewest jobs running; among the jobs of one
-    owner the larger priority comes first, then the older job.
+    Preempted ones first. Then owners take turns, those first who have the fewest jobs running. Among the jobs of one
+    owner the larger priority comes first, and what waits long gains (`_Flow.urgency`); at equal priority the sooner
+    deadline, then the batch that has the fewest jobs running, then the older job. Batches that are paused, and batches
+    and owners of which as many jobs run as may, have none.
+
+    offered: ids of waiting jobs that are on their way to a worker; they are in their places, and count as running where
+    that is limited.
     """
+    holds = read_holds(session, offered)
     running = _running(session)
     use_order_of_index(session)
     depth = FIRST_DEPTH
     while True:
         lines = _read_lines(session, depth, gib)
         with suppress(_Cut):
-            return list(islice(_take_turns(lines, running, depth), max(limit, 0)))
+            return list(islice(_take_turns(lines, running, Allowance(holds, running), now, depth), max(limit, 0)))
         depth *= 4
 
 
@@ -87,45 +104,95 @@ def use_order_of_index(session: Session) -> None:
         session.execute(text("set local enable_sort = off"))
 
 
-def _running(session: Session) -> Mapping[str, int]:
-    query = select(JobRow.owner, func.count()).where(JobRow.state == JobState.running, KEPT).group_by(JobRow.owner)
-    return {owner: int(count) for owner, count in session.execute(query)}
+def _running(session: Session) -> Mapping[Line, int]:
+    query = select(JobRow.line, func.count()).where(JobRow.state == JobState.running, KEPT).group_by(JobRow.line)
+    return {Line.of(line): int(count) for line, count in session.execute(query)}
 
 
-def _read_lines(session: Session, depth: int, gib: int | None) -> Mapping[str, list[Sequence[_Place]]]:
-    """Owner -> the first `depth` rows of each of the lines."""
-    pairs = distinct_pairs(WAITS_IN_LINE, JobRow.owner, JobRow.memory_gib)
+def _read_lines(session: Session, depth: int, gib: int | None) -> Mapping[Line, list[Sequence[_Place]]]:
+    """Line -> its first `depth` rows of each class of memory."""
+    pairs = distinct_pairs(WAITS_FOR_ITS_TURN, JobRow.line, JobRow.memory_gib)
     sqlite = session.get_bind().dialect.name == "sqlite"
     array, gather = (func.json_array, func.json_group_array) if sqlite else (func.json_build_array, func.json_agg)
+    place = (JobRow.state, JobRow.due, JobRow.id, JobRow.attempt, JobRow.deadline, JobRow.created_at)
     front = (
-        select(array(JobRow.state, -JobRow.priority, JobRow.id, JobRow.attempt).label("place"))
-        .where(WAITS_IN_LINE, JobRow.owner == pairs.c.first, JobRow.memory_gib == pairs.c.second)
-        .order_by(JobRow.state, JobRow.priority.desc(), JobRow.id)
+        select(array(*place).label("place"))
+        .where(WAITS_FOR_ITS_TURN, JobRow.line == pairs.c.first, JobRow.memory_gib == pairs.c.second)
+        .order_by(JobRow.state, JobRow.due, JobRow.id)
         .limit(depth)
         .correlate(pairs)
         .subquery()
     )
-    place = func.json(front.c.place) if sqlite else front.c.place  # SQLite forgets in between that it is JSON
-    query = select(pairs.c.first, select(gather(place, type_=JSON)).scalar_subquery())
+    found = func.json(front.c.place) if sqlite else front.c.place  # SQLite forgets in between that it is JSON
+    query = select(pairs.c.first, select(gather(found, type_=JSON)).scalar_subquery())
     query = query.where(pairs.c.second.is_not(None) if gib is None else pairs.c.second <= gib)
-    lines: dict[str, list[Sequence[_Place]]] = defaultdict(list)
-    for owner, places in session.execute(query):
-        lines[owner].append([_Place(*place) for place in places or ()])
+    lines: dict[Line, list[Sequence[_Place]]] = defaultdict(list)
+    for line, places in session.execute(query):
+        lines[Line.of(line)].append([_Place(*one) for one in places or ()])
     return lines
 
 
+class _Flow:
+    """The jobs of one owner, batch and priority, and how many of them run or have been taken."""
+
+    def __init__(self, line: Line, parts: Iterable[Sequence[_Place]], running: int, depth: int) -> None:
+        self.line, self.running = line, running
+        self._places = merge(*(_read_part(part, depth) for part in parts))
+        self.head: _Place | None = None
+        self.advance()
+
+    def advance(self) -> None:
+        self.head = next(self._places, None)
+
+    def urgency(self, now: float) -> tuple[str, int, float, int, str]:
+        """Of its next job, among the owner's flows; the less, the earlier.
+
+        A flow of which nothing runs gains a step of priority for each hour that its next job has waited: one job at a
+        time gets through, however many of a larger priority come so much later.
+        """
+        assert self.head is not None
+        waited = 0 if self.running else int(max(0.0, now - self.head.made) // AGING_SECONDS)
+        deadline = inf if self.head.deadline is None else self.head.deadline
+        return self.head.state, -(self.line.priority + waited), deadline, self.running, self.head.id
+
+
 def _take_turns(
-    lines: Mapping[str, Sequence[Sequence[_Place]]], running: Mapping[str, int], depth: int
+    lines: Mapping[Line, Sequence[Sequence[_Place]]],
+    running: Mapping[Line, int],
+    allowance: Allowance,
+    now: float,
+    depth: int,
 ) -> Iterator[WaitingJob]:
-    owners = [_turns_of_one(mine, running.get(owner, 0), depth) for owner, mine in lines.items()]
-    for state, _turn, job_id, attempt in merge(*owners):
+    flows: dict[str, list[_Flow]] = defaultdict(list)
+    for line, parts in lines.items():
+        flows[line.owner].append(_Flow(line, parts, running.get(line, 0), depth))
+    begun = Counter[str]()
+    for line, count in running.items():
+        begun[line.owner] += count
+    for state, _turn, job_id, attempt in merge(
+        *(_turns_of_one(mine, begun[owner], allowance, now) for owner, mine in flows.items())
+    ):
         yield WaitingJob(job_id, attempt, JobState(state))
 
 
-def _turns_of_one(lines: Sequence[Sequence[_Place]], running: int, depth: int) -> Iterator[tuple[str, int, str, int]]:
+def _turns_of_one(
+    flows: Iterable[_Flow], running: int, allowance: Allowance, now: float
+) -> Iterator[tuple[str, int, str, int]]:
     """An owner's jobs, each with the number of jobs that would be running with it."""
-    for turn, place in enumerate(merge(*(_read_part(line, depth) for line in lines)), running + 1):
-        yield place.state, turn, place.id, place.attempt
+    order = [(flow.urgency(now), number, flow) for number, flow in enumerate(flows)]
+    heapify(order)
+    while order:
+        _, number, flow = heappop(order)
+        place = flow.head
+        assert place is not None
+        if not allowance.take(flow.line, place.id):
+            continue  # and so none behind it may
+        running += 1
+        flow.running += 1
+        yield place.state, running, place.id, place.attempt
+        flow.advance()
+        if flow.head is not None:
+            heappush(order, (flow.urgency(now), number, flow))
 
 
 def _read_part(line: Sequence[_Place], depth: int) -> Iterator[_Place]:

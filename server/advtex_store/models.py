@@ -22,9 +22,10 @@ from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, validates
 LOG_TAIL = 8000  # characters of a log that its row keeps
 
 # Conditions of partial indexes. A query uses such an index only if it says the same in the same words, and the planners
-# know little of how many rows that are: two indexes of waiting rows have words of their own, so that each query has one
-# that it can use, and no index on `state` alone serves either.
+# know little of how many rows that are: the indexes of waiting rows have words of their own, so that each query has one
+# that it can use, and no index on `state` alone serves any. The first is that of the releases before schema 0009.
 WAITS_IN_LINE = text("state || '' in ('preempted', 'queued') and deleted_at is null")
+WAITS_FOR_ITS_TURN = text("'' || state || '' in ('preempted', 'queued') and deleted_at is null")
 WAITS_FOR_A_REASON = text("'' || state in ('preempted', 'queued') and deleted_at is null")
 KEPT = text("deleted_at is null")
 UNTIDY = text("state = 'succeeded' and tidied_at is null and deleted_at is null")
@@ -44,6 +45,7 @@ class ApiKeyRow(Base):
     """`owner` is what objects belong to, so that a key can be replaced without losing them.
 
     max_active_jobs, max_bytes: how much its owner may have before this key is refused more; null for no limit.
+    max_running_jobs: how many of its owner's jobs run at a time; of several keys the least, null for no limit.
     """
 
     __tablename__ = "api_keys"
@@ -55,6 +57,7 @@ class ApiKeyRow(Base):
     scopes: Mapped[list[Any]]
     max_active_jobs: Mapped[int | None]
     max_bytes: Mapped[int | None] = mapped_column(BigInteger)
+    max_running_jobs: Mapped[int | None]
     created_at: Mapped[float]
     expires_at: Mapped[float | None]
     revoked_at: Mapped[float | None]
@@ -117,6 +120,10 @@ class JobRow(Base):
     source: the URL of a scan that stays where it is; its upload row is a mere placeholder.
     memory_bytes: what a worker must have (`memory_estimate.py`). memory_gib: the class of the smallest such worker.
     waiting_reason: for people, the dispatcher's while the job waits and the worker's while it pauses.
+    deadline: by when its owner wants it to have ended.
+    due: what orders a line (`fair_queue.py`). Without a deadline a job is due a week after it was made, so that others
+        do not overtake it for ever.
+    line: the jobs of one owner, batch and priority.
     checked_at: when its scan was found good. Until then `worker`, `lease_expires_at` and `deaths` are the checker's
     (`checks.py`); a time without a worker is when the next check may begin.
     tidied_at: when what no result needs was removed.
@@ -136,6 +143,11 @@ class JobRow(Base):
     priority: Mapped[int] = mapped_column(default=0)
     memory_bytes: Mapped[int] = mapped_column(BigInteger, default=0)
     memory_gib: Mapped[int] = mapped_column(BigInteger, Computed("(memory_bytes + 1073741823) / 1073741824"))
+    deadline: Mapped[float | None]
+    due: Mapped[float] = mapped_column(Computed("coalesce(deadline, created_at + 604800.0)"))
+    line: Mapped[str] = mapped_column(
+        Text, Computed("cast(priority as text) || '/' || coalesce(batch, '') || '/' || owner")
+    )
     checked_at: Mapped[float | None]
     waiting_reason: Mapped[str] = mapped_column(default="")
     attempt: Mapped[int] = mapped_column(default=1)
@@ -167,6 +179,7 @@ class JobRow(Base):
         Index("ix_jobs_owner_batch_id", "owner", "batch", "id"),
         _partial("ix_jobs_state_id", "state", "id", where=KEPT),
         _partial("ix_jobs_line", "owner", "memory_gib", "state", priority.desc(), "id", where=WAITS_IN_LINE),
+        _partial("ix_jobs_turn", "line", "memory_gib", "state", "due", "id", where=WAITS_FOR_ITS_TURN),
         _partial("ix_jobs_reason", "memory_gib", "waiting_reason", where=WAITS_FOR_A_REASON),
         _partial("ix_jobs_expires_at", "expires_at", where=KEPT),
         _partial("ix_jobs_finished_at", "finished_at", where=ENDED),
@@ -178,6 +191,21 @@ class JobRow(Base):
     def _shortened(self, _name: str, text: str) -> str:
         """The newest of it. Libraries print what they like, and PostgreSQL's text has no NUL."""
         return text[-LOG_TAIL:].replace("\0", "\ufffd")
+
+
+class BatchRow(Base):
+    """What its owner has said of a batch as a whole; one of which nothing was said has no row.
+
+    paused_at: since when none of its jobs begins. max_running: how many of them run at a time.
+    """
+
+    __tablename__ = "batches"
+
+    owner: Mapped[str] = mapped_column(primary_key=True)
+    id: Mapped[str] = mapped_column(primary_key=True)
+    paused_at: Mapped[float | None]
+    max_running: Mapped[int | None]
+    updated_at: Mapped[float]
 
 
 class EventRow(Base):

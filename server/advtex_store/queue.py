@@ -34,8 +34,35 @@ DECLINED = "advtex:declined"  # attempts, scored by when they may be offered aga
 DECLINED_SECONDS = 10.0
 PRESENCE = "advtex:worker:"
 BUSY = " busy"
+NEAR = "advtex:near:"  # attempts whose scans a machine has, by its name
+NEAR_SECONDS = 30
+DOWNLOAD = "advtex:download:"  # a scan that a machine downloads ahead, so that no other does
+DOWNLOAD_SECONDS = 600
+PASSED = "advtex:passed:"  # how often an attempt was passed over
+PASSED_SECONDS = 86400
+PASSES = 3  # and no more
 SCANNED = 10_000  # keys that Redis looks at in one go, a few milliseconds; there are some per worker
 PRESENCE_SECONDS = 20  # a worker that has not announced itself for so long is gone
+
+# Puts the first attempt that the machine has the scan of in front of those that it has not.
+_PREFER = """
+local passed = {}
+for _, name in ipairs(redis.call('lrange', KEYS[1], 0, -1)) do
+  if redis.call('sismember', KEYS[2], name) == 1 then
+    for _, other in ipairs(passed) do
+      redis.call('incr', ARGV[1] .. other)
+      redis.call('expire', ARGV[1] .. other, ARGV[3])
+    end
+    redis.call('lrem', KEYS[1], 1, name)
+    redis.call('lpush', KEYS[1], name)
+    return
+  end
+  if tonumber(redis.call('get', ARGV[1] .. name) or 0) >= tonumber(ARGV[2]) then
+    return
+  end
+  passed[#passed + 1] = name
+end
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,11 +136,19 @@ class JobQueue:
         names = sorted(text_of(key).removeprefix(PRESENCE) for key in found)
         return [name for name in names if not host or name.rpartition("-")[0] == host]
 
+    def busy_workers(self, host: str) -> list[str]:
+        """Names of the host's workers that have a job."""
+        return [name for name, told in self._announced(host).items() if told.endswith(BUSY)]
+
+    def _announced(self, host: str = "") -> dict[str, str]:
+        """What the living workers tell, by their names."""
+        names = self.workers(host)
+        told = self.redis.mget([PRESENCE + name for name in names]) if names else []
+        return {name: text_of(value) for name, value in zip(names, told, strict=True) if value is not None}
+
     def classes(self) -> list[WorkerClass]:
         """The classes of which workers live, smallest first."""
-        names = self.workers()
-        told = self.redis.mget([PRESENCE + name for name in names]) if names else []
-        known = [text_of(value) for value in told if value is not None]
+        known = self._announced().values()
         count = Counter(int(value.removesuffix(BUSY)) for value in known)
         idle = Counter(int(value) for value in known if not value.endswith(BUSY))
         return [WorkerClass(gib, workers, idle[gib]) for gib, workers in sorted(count.items())]
@@ -159,6 +194,27 @@ class JobQueue:
         pipeline.zrange(DECLINED, 0, -1)
         return [text_of(name) for name in pipeline.execute()[1]]
 
+    def tell_near(self, host: str, names: Sequence[str]) -> None:
+        """Of what waits, the attempts (`job-attempt`) whose scans the machine has."""
+        pipeline = self.redis.pipeline()
+        pipeline.delete(NEAR + host)
+        if names:
+            pipeline.sadd(NEAR + host, *names)
+            pipeline.expire(NEAR + host, NEAR_SECONDS)
+        pipeline.execute()
+
+    def prefer_near(self, host: str, gib: int) -> None:
+        """Called before an attempt is taken: let the next one be one whose scan the machine has.
+
+        It is delay scheduling (Zaharia et al. 2010): no attempt is passed over more than a few times.
+        """
+        keys = (_key(queue_name(gib)), NEAR + host)
+        self.redis.eval(_PREFER, len(keys), *keys, PASSED, str(PASSES), str(PASSED_SECONDS))
+
+    def download_ahead(self, upload_id: str) -> bool:
+        """Whether the caller may download a scan for an attempt that it does not have; one machine at a time may."""
+        return bool(self.redis.set(DOWNLOAD + upload_id, "", nx=True, ex=DOWNLOAD_SECONDS))
+
     def withdraw(self, keep: set[int]) -> None:
         """Take back what waits for workers of classes that are not in `keep`: nobody listens there any more."""
         kept = {queue_name(gib) for gib in keep}
@@ -172,9 +228,17 @@ class JobQueue:
         """Of what waits for a class, the last `count`. -> what came back: a worker may have just taken some."""
         return self._remove(queue_name(gib), -count)
 
+    def take_away(self, gib: int, names: Sequence[str]) -> list[str]:
+        """Of what waits for a class, these. -> what came back."""
+        return self._take(_key(queue_name(gib)), names)
+
     def _remove(self, queue: str, first: int) -> list[str]:
-        removed, key = [], _key(queue)
-        for name in map(text_of, self.redis.lrange(key, first, -1)):
+        key = _key(queue)
+        return self._take(key, [text_of(raw) for raw in self.redis.lrange(key, first, -1)])
+
+    def _take(self, key: str, names: Sequence[str]) -> list[str]:
+        removed = []
+        for name in names:
             if self.redis.lrem(key, 1, name):  # else a worker has just come and taken it
                 removed.append(name)
                 with suppress(NoSuchJobError):

@@ -31,7 +31,7 @@ Every one of these carries the attempt's number; `StaleAttempt` is raised when i
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,6 +47,7 @@ from advtex_store.counters import ATTEMPTS, count_one
 from advtex_store.database import Database
 from advtex_store.errors import IllegalTransition, NotUnderstood, StaleAttempt
 from advtex_store.fair_queue import WaitingJob, distinct_pairs, next_jobs, use_order_of_index
+from advtex_store.lines import read_holds
 from advtex_store.memory_estimate import GIB
 from advtex_store.models import KEPT, WAITS_FOR_A_REASON, EventRow, JobRow
 from advtex_store.transitions import Transitions, held, record_event
@@ -246,10 +247,28 @@ class Records(Transitions):
 
     # -- dispatcher and reconciler --------------------------------------------------------------------------------
 
-    def waiting(self, limit: int, memory_bytes: int | None = None) -> list[WaitingJob]:
-        """Jobs to run next, of those that fit a worker of so much memory, as `fair_queue` orders them."""
+    def waiting(self, limit: int, memory_bytes: int | None = None, offered: Collection[str] = ()) -> list[WaitingJob]:
+        """Jobs to run next, of those that fit a worker of so much memory, as `fair_queue` orders them.
+
+        offered: ids of those that are on their way to a worker.
+        """
+        gib = None if memory_bytes is None else memory_bytes // GIB
         with self.database.read() as session:
-            return next_jobs(session, limit, None if memory_bytes is None else memory_bytes // GIB)
+            return next_jobs(session, limit, self.database.now(session), gib, offered)
+
+    def paused(self, offered: Collection[str]) -> set[str]:
+        """Of the jobs that are on their way to a worker those whose batch was paused."""
+        with self.database.read() as session:
+            if not (batches := read_holds(session).paused):
+                return set()
+            query = select(JobRow.id, JobRow.owner, JobRow.batch).where(JobRow.id.in_(list(offered)))
+            return {job_id for job_id, *batch in session.execute(query) if tuple(batch) in batches}
+
+    def uploads_of(self, job_ids: Sequence[str]) -> dict[str, str]:
+        """The uploads of those of the jobs whose scans were sent, not referred to."""
+        with self.database.read() as session:
+            query = select(JobRow.id, JobRow.upload_id).where(JobRow.id.in_(job_ids), JobRow.source.is_(None))
+            return {row.id: row.upload_id for row in session.execute(query)}
 
     def any_preempted(self) -> bool:
         """Whether a job waits that had to give its worker back."""

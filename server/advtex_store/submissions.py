@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import secrets
 from dataclasses import dataclass
+from datetime import datetime
 
 from sqlalchemy import delete, select, update
 from sqlalchemy.dialects import postgresql, sqlite
@@ -84,8 +85,10 @@ class Submissions:
 
     def _is_made_of(self, row: JobRow, spec: JobSpec) -> bool:
         scan = row.source == spec.source and (spec.source is not None or row.upload_id == spec.upload_id)
-        asked = (spec.options, spec.label, spec.batch, spec.priority, spec.retention_seconds or self.retention_seconds)
-        return scan and (read_options(row.options), row.label, row.batch, row.priority, row.retention_seconds) == asked
+        kept = spec.retention_seconds or self.retention_seconds
+        asked = (spec.options, spec.label, spec.batch, spec.priority, kept, _seconds(spec.deadline))
+        told = (read_options(row.options), row.label, row.batch, row.priority, row.retention_seconds, row.deadline)
+        return scan and told == asked
 
     def release(self, reservation: Reservation) -> None:
         """The request made no job: the key is free again."""
@@ -129,6 +132,7 @@ class Submissions:
                 label=spec.label,
                 options=spec.options.model_dump(mode="json"),
                 priority=spec.priority,
+                deadline=_seconds(spec.deadline),
                 attempt=0,
                 progress=Progress().model_dump(mode="json"),
                 warnings=[],
@@ -171,6 +175,10 @@ class Submissions:
         with self.database.read() as session:
             rows = list(session.scalars(query.order_by(JobRow.id.desc()).limit(limit + 1)))
         return rows[:limit], rows[limit - 1].id if len(rows) > limit else None
+
+
+def _seconds(time: datetime | None) -> float | None:
+    return None if time is None else time.timestamp()
 
 
 def _finished(session: Session, owner: str, spec: JobSpec) -> UploadRow:

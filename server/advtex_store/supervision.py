@@ -51,6 +51,11 @@ class Supervised:
         """Of the living process."""
         return self._process.pid if self._process is not None and self._process.poll() is None else None
 
+    @property
+    def exit_code(self) -> int | None:
+        """Of the process that has ended; None while it lives, or before it was started."""
+        return None if self._process is None else self._process.poll()
+
     def start(self) -> None:
         """Start it. Its output goes to this process's stderr, so that stdout stays for machine-readable lines."""
         self._asked = False

@@ -8,7 +8,6 @@ from typing import Any
 
 import compiled
 import discriminator
-import examples
 import game
 import harness
 import paper
@@ -20,6 +19,7 @@ import sparsity
 import study
 import torch
 
+import examples
 from advtex_engine.adversarial.discriminator import PatchDiscriminator
 from advtex_engine.metrics.lpips import NETWORKS
 from advtex_engine.synthetic import patches

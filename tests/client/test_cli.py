@@ -7,6 +7,7 @@ import importlib.util
 import json
 import subprocess
 import sys
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -377,3 +378,49 @@ def test_a_deep_check_without_the_engine_says_what_to_install(scan: Path, monkey
     assert 'pip install "advtex[worker]"' in ran.stderr
     deep_answer(monkeypatch, hopeless=False, stdout="")
     assert "the engine could not measure" in run("check", scan, "--deep").stderr
+
+
+def test_what_is_said_of_a_batch_as_a_whole(monkeypatch: pytest.MonkeyPatch, scan: Path, tmp_path: Path) -> None:
+    """By the command line; a server from before that is told apart from a batch that is not there."""
+    asked: list[tuple[str, str, str]] = []
+    paused, knows = False, True
+
+    def handle(request: httpx.Request) -> httpx.Response:
+        asked.append((request.method, request.url.path, request.content.decode()))
+        if request.method == "PUT":
+            return httpx.Response(204) if knows else httpx.Response(404, json={"code": "not_found", "message": "no"})
+        if request.url.path == "/v1/jobs":
+            spec = json.loads(request.content)
+            return httpx.Response(201, text=view("j0", label=spec["label"]).model_dump_json())
+        told = paused if request.method == "GET" else request.url.path.endswith("pause")
+        batch = BatchView(id="night", jobs=1, states={}, finished=False, paused=told, created_at=NOW, updated_at=NOW)
+        return httpx.Response(200, text=batch.model_dump_json())
+
+    def connect(url: str | None, api_key: str | None) -> Client:
+        return Client("http://server.test", "k", transport=httpx.MockTransport(handle), retries=0)
+
+    monkeypatch.setattr(cli_batch, "Client", connect)
+    options, manifest = tmp_path / "night.toml", tmp_path / "list.csv"
+    options.write_text('preset = "full"\nsize = "320x240"\n')
+    manifest.write_text("path\nfile:///scans/a\n")
+    flags = ("--options", options, "--preset", "preview", "--max-running", "3", "--deadline", "2026-01-31T08:00+00:00")
+    assert run("batch", "submit", manifest, "--id", "night", *flags).exit_code == 0
+    assert asked[0] == ("PUT", "/v1/batches/night/limits", '{"max_running":3}')
+    spec = json.loads(asked[1][2])
+    assert (spec["options"]["preset"], spec["options"]["width"]) == ("preview", 320), "a flag goes before the file"
+    assert datetime.fromisoformat(spec["deadline"]).timestamp() == 1769846400
+    knows = False
+    refused = run("batch", "submit", manifest, "--id", "night", *flags)
+    assert (refused.exit_code, "leave --max-running out" in refused.stderr) == (2, True)
+    assert run("batch", "submit", manifest, "--id", "night", "--deadline", "soon").exit_code == 2
+    assert "paused" in run("batch", "pause", "night").stdout
+    asked.clear()
+    paused = True
+    resumed = run("batch", "resume", "other")
+    assert (resumed.exit_code, [path for _, path, _ in asked]) == (0, ["/v1/batches/other", "/v1/batches/other/resume"])
+    assert "paused" not in resumed.stdout
+    paused = False
+    assert run("batch", "resume", "other").exit_code == 2, "not paused, and submitted elsewhere"
+    asked.clear()
+    assert run("batch", "resume", "night").exit_code == 0
+    assert ("POST", "/v1/jobs") in [(method, path) for method, path, _ in asked]

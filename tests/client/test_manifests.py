@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from advtex_client import ClientError
-from advtex_client.manifests import read_items
-from advtex_contract.options import JobOptions, Preset
+from advtex_client.manifests import read_items, read_options
+from advtex_contract.options import JobOptions, Preset, chosen_options
 
 QUICK = JobOptions(preset=Preset.preview, seed=3)
 
@@ -68,6 +70,57 @@ def test_each_option_may_have_a_column(scenes: Path) -> None:
     assert second.options == QUICK
 
 
+def test_deadlines(scenes: Path) -> None:
+    usual = datetime(2026, 2, 1, 8, tzinfo=UTC)
+    text = "path,deadline\nscene0000_00,2026-01-31T08:00+02:00\nscene0000_01,\npacked.zip,2026-01-31T08:00\n"
+    first, second, third = read_items(write(scenes, "list.csv", text), QUICK, deadline=usual)
+    assert first.deadline == datetime(2026, 1, 31, 6, tzinfo=UTC)
+    assert second.deadline == usual
+    assert third.deadline == datetime(2026, 1, 31, 8).astimezone(), "of this computer's time zone"
+    assert len({first.identity, replace(first, deadline=None).identity, replace(first, deadline=usual).identity}) == 3
+
+
+def test_the_root_of_scannet(tmp_path: Path) -> None:
+    for name in ("scene0000_01", "scene0000_00", "scene0707_00", "notes"):
+        (tmp_path / "scans" / name).mkdir(parents=True)
+    (tmp_path / "scans" / "scene0001_00").touch()
+    (tmp_path / "scans_test").mkdir()
+    items = read_items(tmp_path, QUICK)
+    assert [item.label for item in items] == ["scene0000_00", "scene0000_01", "scene0707_00"]
+    assert items[0].path == tmp_path / "scans" / "scene0000_00"
+    (item,) = read_items(write(tmp_path / "scans", "list.csv", "path\nscene0000_00\n"), QUICK)
+    assert item.identity == items[0].identity, "a manifest names the same scan"
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("night.toml", 'preset = "full"\nsize = "320x240"\nholdout = 8\n'),
+        ("night.json", '{"preset": "full", "size": "320x240", "holdout": 8}'),
+    ],
+)
+def test_a_file_of_options(tmp_path: Path, name: str, text: str) -> None:
+    options = chosen_options(read_options(write(tmp_path, name, text)))
+    assert options == JobOptions(preset=Preset.full, width=320, height=240, holdout=8)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("night.toml", "preset = full\n", "night.toml cannot be read"),
+        ("night.json", "[1]", "night.json is no JSON object"),
+        ("night.json", '{"prseet": "full"}', "night.json: there is no option 'prseet'; the options are preset"),
+        ("night.toml", "\xff", "night.toml cannot be read"),
+    ],
+)
+def test_a_mistake_in_a_file_of_options_is_named(tmp_path: Path, name: str, text: str, message: str) -> None:
+    with pytest.raises(ClientError) as caught:
+        read_options(write(tmp_path, name, text))
+    assert message in str(caught.value)
+    with pytest.raises(ClientError, match=r"none\.toml cannot be read"):
+        read_options(tmp_path / "none.toml")
+
+
 def test_json_lines(scenes: Path) -> None:
     rows = [{"path": "scene0000_00", "options": {"steps": 7}}, {"path": "file:///data/x/", "priority": 9}]
     text = "\n".join(map(json.dumps, rows)) + "\n\n"
@@ -89,6 +142,8 @@ def test_json_lines(scenes: Path) -> None:
         ("a.csv", "path,priority\nx,high\n", "priority and keep_days numbers"),
         ("a.jsonl", '{"path": "x", "priority": Infinity}\n', "priority and keep_days numbers"),
         ("a.csv", "path,keep_days\nx,long\n", "priority and keep_days numbers"),
+        ("a.csv", "path,deadline\nx,soon\n", "keep_days numbers: Invalid isoformat string: 'soon'"),
+        ("a.jsonl", '{"path": "x", "deadline": 3}\n', "deadline an ISO time"),
         (
             "a.csv",
             "path,keep_days\nx,-1\n",
@@ -123,7 +178,7 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
 
 values = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=10) | st.lists(st.integers())
 rows = st.dictionaries(
-    st.sampled_from(["path", "label", "options", "priority", "keep_days"]) | st.text(max_size=5),
+    st.sampled_from(["path", "label", "options", "priority", "keep_days", "deadline"]) | st.text(max_size=5),
     values | st.dictionaries(st.sampled_from(["steps", "preset", "x"]), values, max_size=2),
     max_size=4,
 )

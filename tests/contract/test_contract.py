@@ -14,6 +14,8 @@ from pydantic import ValidationError
 from advtex_contract.errors import ErrorBody, ErrorCode, ErrorDetail
 from advtex_contract.jobs import RETRYABLE, STATES, TERMINAL, JobSpec, JobState, JobView
 from advtex_contract.options import PRESET_HELP, JobOptions, Preset, chosen_options
+from advtex_options import refusal
+from advtex_options.box import Box, parse_box
 from advtex_options.methods import METHOD_HELP
 
 
@@ -56,6 +58,25 @@ def test_yes_or_no_may_be_written_as_a_column_has_it(given: object, meant: bool 
 def test_neither_yes_nor_no_is_refused() -> None:
     with pytest.raises(ValueError, match=r"lossless 'maybe' is neither true nor false; give one of them, or leave it"):
         chosen_options({"lossless": "maybe"})
+
+
+def test_a_box_is_a_center_a_size_and_a_turn() -> None:
+    given = "0, -1.5,1e-1,2,2,2,30"
+    assert JobOptions.model_validate({"box": given}).box == given
+    assert parse_box(given) == Box((0, -1.5, 0.1), (2, 2, 2), 30)
+    assert parse_box("0,0,0,1,2,3") == Box((0, 0, 0), (1, 2, 3), 0)
+
+
+@pytest.mark.parametrize(
+    "given", ["", "0,0,0,1,1", "0,0,0,1,1,0", "0,0,0,1,1,nan", "0,0,0,1,1,1,30,4", "a box", "0 0 0 1 1 1"]
+)
+def test_what_is_no_box_is_refused_in_the_same_words_everywhere(given: str) -> None:
+    words = "is no box; give it as X,Y,Z,SIZE_X,SIZE_Y,SIZE_Z"
+    with pytest.raises(ValidationError, match=words):
+        JobOptions.model_validate({"box": given})
+    with pytest.raises(ValueError, match=words):
+        chosen_options({"box": given})
+    assert words in str(refusal("box", given))
 
 
 @pytest.mark.parametrize("side", ["width", "height"])
@@ -130,3 +151,12 @@ def test_the_contract_is_light() -> None:
         "print([m for m in ('httpx', 'redis', 'numpy', 'torch', 'fastapi', 'sqlalchemy') if m in sys.modules])"
     )
     assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+def test_a_deadline_that_is_not_given_is_not_written() -> None:
+    """A server from before deadlines refuses a name that it does not know; the rest is written as it always was."""
+    spec = JobSpec(upload_id="u")
+    assert "deadline" not in spec.model_dump(mode="json")
+    assert '"source":null' in spec.model_dump_json()
+    due = JobSpec(upload_id="u", deadline=datetime(2026, 1, 31, 8, tzinfo=UTC))
+    assert JobSpec.model_validate_json(due.model_dump_json()) == due

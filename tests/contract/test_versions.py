@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 
 from advtex_contract import errors, health, jobs, live, options, stored_options, webhooks
 
-SENT = {jobs.JobSpec, options.JobOptions, webhooks.WebhookSpec}
+SENT = {jobs.BatchLimits, jobs.JobSpec, options.JobOptions, webhooks.WebhookSpec}
 MODELS = sorted(
     {
         model

@@ -37,7 +37,11 @@ ROOMS = ("client", "server", "worker")
 DOCKERFILES = sorted((ROOT / "docker").glob("*.Dockerfile"))
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text())
-SETTINGS: dict[str, type[StoreSettings]] = {"server": ServerSettings, "worker": WorkerSettings}
+SETTINGS: dict[str, type[StoreSettings]] = {
+    "server": ServerSettings,
+    "worker": WorkerSettings,
+    "worker-cpu": WorkerSettings,
+}
 HEAVY = ("torch", "fastapi", "redis", "rq", "numpy", "sqlalchemy", "cv2")
 
 
@@ -120,7 +124,7 @@ class TestPackages:
 
 
 def test_shellcheck_finds_nothing() -> None:
-    assert tool("shellcheck", *(ROOT / ".ci").iterdir()).returncode == 0
+    assert tool("shellcheck", *(ROOT / ".ci").iterdir(), *(ROOT / "docker" / "slurm").iterdir()).returncode == 0
 
 
 class TestImages:
@@ -137,6 +141,7 @@ class TestImages:
         last = text.rpartition("FROM ")[2]
         assert re.findall(r"^USER (\S+)", last, re.MULTILINE) == ["10001"]
         assert "HEALTHCHECK" in last
+        assert re.search(r"cyclonedx-bom==\S+\s.*cyclonedx-py environment --output-file /opt/advtex/", text, re.DOTALL)
         assert "COPY --from=build" in last
         assert "pip" not in last
 
@@ -222,10 +227,18 @@ class TestCompose:
         lines = COMPOSE["configs"]["redis"]["content"].splitlines()
         assert {"appendonly yes", "maxmemory-policy noeviction"} <= set(lines)
 
-    def test_a_worker_has_a_gpu_and_time_for_its_checkpoint(self) -> None:
-        worker = COMPOSE["services"]["worker"]
-        (device,) = worker["deploy"]["resources"]["reservations"]["devices"]
+    def test_a_worker_has_a_gpu_unless_the_profile_says_that_there_is_none(self) -> None:
+        gpu, cpu = (dict(COMPOSE["services"][name]) for name in ("worker", "worker-cpu"))
+        (device,) = gpu.pop("deploy")["resources"]["reservations"]["devices"]
         assert device["capabilities"] == ["gpu"]
+        assert cpu.pop("deploy") == {}
+        assert (gpu.pop("profiles"), cpu.pop("profiles")) == (["gpu"], ["cpu"])
+        assert gpu == cpu, "nothing else tells them apart"
+        others = [name for name, service in COMPOSE["services"].items() if "profiles" not in service]
+        assert {"server", "postgres", "redis", "minio", "bucket"} == set(others)
+
+    def test_a_worker_has_time_for_its_checkpoint(self) -> None:
+        worker = COMPOSE["services"]["worker"]
         grace = float(worker["environment"]["ADVTEX_GRACE_SECONDS"])
         assert float(worker["stop_grace_period"].removesuffix("s")) > grace
 

@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import time
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -182,6 +182,7 @@ def check_result(page: Page, web: Browsing, axe: str) -> None:
     deadline = time.monotonic() + 30
     while np.abs(canvas(page) - drawn).mean() < 1:
         assert time.monotonic() < deadline, "the model does not turn"
+    check_tools(page)
     compare = page.locator("#compare")
     range_ = compare.get_by_role("slider")
     whole = pixels(compare.locator(".slider").screenshot())
@@ -205,6 +206,45 @@ def check_result(page: Page, web: Browsing, axe: str) -> None:
     with page.expect_download() as download:
         page.get_by_role("link", name="model.glb").click()
     assert download.value.path().read_bytes().startswith(b"glTF")
+
+
+def check_tools(page: Page) -> None:
+    """Light and background change, distances are in metres, photographs lie over the model and are blended with it."""
+    drawn = canvas(page)
+    page.get_by_label("Light", exact=True).select_option("Studio light")
+    wait_until(page, lambda: np.abs(canvas(page) - drawn).mean() > 1, "the light does not change")
+    page.get_by_label("Light", exact=True).select_option("As photographed")
+    page.get_by_label("Background").select_option("Dark")
+    expect(page.locator(".stage")).to_have_css("background-color", "rgb(20, 25, 28)")
+    page.get_by_label("Compare with").select_option("000002, held out")
+    wipe = page.get_by_role("slider", name="Photograph against model")
+    expect(wipe).to_be_visible()
+    page.get_by_role("button", name="Measure").click()
+    stage = page.locator(".stage").bounding_box()
+    assert stage is not None
+    focal = 90 * min(stage["width"] / 96, stage["height"] / 72)  # the stage holds the photograph, which is 2 m away
+    for pixels_aside in (0, 90):
+        page.mouse.click(stage["x"] + stage["width"] / 2 - pixels_aside, stage["y"] + stage["height"] / 2)
+    told = page.get_by_text(re.compile(r"Distance: \d+\.\d cm"))
+    expect(told).to_be_visible()
+    assert float(told.inner_text().split()[1]) == pytest.approx(100 * 2 * 90 / focal, abs=0.5)
+    page.get_by_role("button", name="Measure").click()
+    photographs = page.get_by_role("button", name="Photographs where you stand")
+    photographs.click()
+    expect(page.locator(".lumigraph")).to_be_visible()
+    expect(wipe).to_be_visible()
+    page.evaluate("document.querySelector('model-viewer').shadowRoot.querySelector('.userInput').focus()")
+    page.keyboard.press("ArrowLeft")
+    expect(wipe).to_be_hidden()
+    photographs.click()
+    expect(page.locator(".lumigraph")).to_be_hidden()
+
+
+def wait_until(page: Page, holds: Callable[[], bool], problem: str) -> None:
+    deadline = time.monotonic() + 30
+    while not holds():
+        assert time.monotonic() < deadline, problem
+        page.wait_for_timeout(50)
 
 
 def canvas(page: Page) -> Any:
@@ -367,6 +407,36 @@ def axe(request: pytest.FixtureRequest) -> str:
         command = [npm, "install", "--no-save", "--no-audit", "--no-fund", "--ignore-scripts"]
         subprocess.run(command, cwd=folder, check=True, capture_output=True, timeout=240)
     return script.read_text()
+
+
+IPHONE = """
+    const known = DOMTokenList.prototype.supports;
+    DOMTokenList.prototype.supports = function (token) { return token === "ar" || known.call(this, token); };
+    Object.defineProperty(navigator, "userAgent", { get: () => "iPhone" });
+    window.opened = new Promise((resolve) => {
+        HTMLAnchorElement.prototype.click = function () { resolve({ rel: this.rel, href: this.href }); };
+    });
+"""
+
+
+def test_quick_look_gets_the_usdz_without_the_session(web: Browsing, archive: Path) -> None:
+    with web.service.client() as client:
+        spec = JobSpec(upload_id=client.upload(archive).id)
+        job = client.create_job(spec, idempotency_key="for AR").id
+        client.wait_for_job(job, timeout=60)
+        usdz = next(file for file in client.get_job(job).results if file.name == "model.usdz")
+    page = web.page()
+    page.add_init_script(IPHONE)
+    page.goto(f"/jobs/{job}")
+    page.get_by_role("button", name="View in AR").click(timeout=VIEWER_MS)
+    opened = page.evaluate("opened")
+    assert opened["rel"] == "ar"
+    assert opened["href"].startswith("blob:"), "Quick Look sends no cookies"
+    blob = page.evaluate(
+        "async (address) => { const found = await (await fetch(address)).blob(); return [found.type, found.size]; }",
+        opened["href"].partition("#")[0],
+    )
+    assert blob == ["model/vnd.usdz+zip", usdz.size]
 
 
 def test_every_page_is_open_to_all_and_fits_every_screen(web: Browsing, axe: str, archive: Path) -> None:

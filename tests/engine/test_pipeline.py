@@ -10,11 +10,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+import trimesh
 
+from advtex_engine import pipeline
 from advtex_engine.core.config import PRESETS, TextureConfig, resolve_preset
 from advtex_engine.core.errors import OptionError, Problem, ScanError, Stopped
 from advtex_engine.core.monitor import STAGES, Glimpse, Monitor, WarningKeeper
@@ -95,6 +98,7 @@ def test_a_run_leaves_models_previews_and_a_report(whole: tuple[Path, Recorder])
         "model.png",
         "model.glb",
         "model.usdz",
+        "model_seen.png",
         "previews/comparison.png",
         "previews/sheet.png",
     ):
@@ -116,8 +120,32 @@ def test_a_run_leaves_models_previews_and_a_report(whole: tuple[Path, Recorder])
     assert set(report["heldout"]) == {"texture", "mean"}
     assert 0 < report["speckled_texels"] < 0.5
     assert report["options"]["steps"] == STEPS
+    assert report["surface"]["seen"] > 0.5
+    assert sum(report["surface"].values()) == pytest.approx(1)
+    assert set(report["mesh"].values()) == {0}, "nothing is left out of the mesh, or added to it"
     assert {"graph", "steps_per_launch", "kernels", "precision", "reasons"} <= set(report["step"])
     assert report["versions"]["torch"].startswith("2.")
+
+
+def test_a_box_is_cut_out_closed_and_rid_of_what_was_never_seen(
+    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline, "write_gallery", lambda *_: ())  # they take longer than all else
+    monkeypatch.setattr(pipeline, "write_page", lambda out, *_: out / "index.html")
+    config = replace(CONFIG, method="mean", refine=False, box="0,0,0.2,1,1,0.2", close_holes=2.0)
+    whole = texture_scan(scan, tmp_path / "whole", config, work=tmp_path / "work").report
+    mesh, surface = whole["mesh"], whole["surface"]
+    assert mesh["faces_outside_box"] > 0
+    assert mesh["closed_holes"] >= 1
+    assert mesh["made_up_faces"] > 0
+    assert surface["unseen"] > 0.05, "the cut is wide, and no part of it counts as seen"
+    recorder = Recorder()
+    config = replace(config, unseen="remove")
+    texture_scan(scan, tmp_path / "seen", config, work=tmp_path / "work", resume=True, monitor=recorder)
+    assert "geometry" not in recorder.stages, "what is kept serves this as well"
+    all_of_it, seen = (trimesh.load(tmp_path / name / "model.glb", force="mesh") for name in ("whole", "seen"))
+    assert len(seen.faces) < len(all_of_it.faces) == whole["scan"]["faces"]
+    assert 1 - seen.area / all_of_it.area == pytest.approx(surface["unseen"], abs=0.05)
 
 
 def test_a_stopped_run_resumes_to_the_same_bytes_without_redoing_earlier_stages(

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import signal
 import sqlite3
 import time
 from pathlib import Path
 
-import fake_engines
 import pytest
 from live_service import LiveService, process_tree, wait_until
+from outcomes import assert_done_once
 
 from advtex_client import Client
-from advtex_contract.jobs import JobState, JobView
+from advtex_contract.jobs import JobState
 from advtex_contract.options import JobOptions
 from advtex_store import keys
+from advtex_store.models import JobRow
 
 STEPS = 120
 
@@ -33,27 +33,18 @@ def begin(service: LiveService, client: Client, scan: Path, steps: int = STEPS) 
     return job.id, tree
 
 
-def assert_done_once(service: LiveService, client: Client, job_id: str, steps: int = STEPS) -> dict[str, list[int]]:
-    """Every step counts once in the result, and there is one manifest. -> the engine's own account."""
-    job: JobView = client.wait_for_job(job_id, timeout=60)
-    (result,) = [file for file in job.results if file.name == "model.obj"]
-    manifest = service.store.results.manifest(job_id)
-    text = b"".join(
-        chunk for file in manifest.files if file.name == "model.obj" for chunk in service.store.blobs.stream(file.key)
-    )
-    assert len(text) == result.size
-    state = json.loads(text.decode().split("\n", 1)[1])
-    assert state["step"] == steps
-    assert state["chain"] == fake_engines.chain(steps)
-    assert {file.key.split("/")[3] for file in manifest.files} == {str(manifest.attempt)}
-    return state
+def kill_all(tree: list[int]) -> None:
+    """At once; some are gone with their parent before it is their turn."""
+    for pid in tree:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
 
 
 def test_the_runner_alone(service: LiveService, scan: Path) -> None:
     with service.client() as client:
         job_id, (_, _, runner) = begin(service, client, scan)
         os.kill(runner, signal.SIGKILL)
-        state = assert_done_once(service, client, job_id)
+        state = assert_done_once(service, client, job_id, STEPS)
         assert len(state["began"]) == 2
         assert state["began"][1] >= 10
         assert client.get_job(job_id).attempt == 2
@@ -64,7 +55,7 @@ def test_the_work_horse_alone(service: LiveService, scan: Path) -> None:
         job_id, (_, horse, runner) = begin(service, client, scan)
         os.kill(horse, signal.SIGKILL)
         wait_until(lambda: runner not in process_tree(runner), seconds=2.0)
-        state = assert_done_once(service, client, job_id)
+        state = assert_done_once(service, client, job_id, STEPS)
         assert state["began"][1] >= 10
 
 
@@ -75,17 +66,16 @@ def test_the_worker_alone_takes_its_horse_and_runner_with_it(service: LiveServic
         wait_until(lambda: not any(process_tree(pid) for pid in tree[1:]), seconds=5.0)
         assert client.get_job(job_id).state is JobState.preempted, "the horse had time to give its job back"
         service.start_worker("stepping")
-        state = assert_done_once(service, client, job_id)
+        state = assert_done_once(service, client, job_id, STEPS)
         assert state["began"][1] >= 15
 
 
 def test_the_whole_tree(service: LiveService, scan: Path) -> None:
     with service.client() as client:
         job_id, tree = begin(service, client, scan)
-        for pid in tree:
-            os.kill(pid, signal.SIGKILL)
+        kill_all(tree)
         service.start_worker("stepping")
-        state = assert_done_once(service, client, job_id)
+        state = assert_done_once(service, client, job_id, STEPS)
         assert state["began"][1] >= 10
         assert client.get_job(job_id).attempt == 2
 
@@ -107,25 +97,34 @@ def test_a_stopped_worker_that_wakes_up_late_commits_nothing(service: LiveServic
         wait_until(lambda: client.get_job(job_id).attempt == 2)
         for pid in tree:
             os.kill(pid, signal.SIGCONT)
-        state = assert_done_once(service, client, job_id)
+        state = assert_done_once(service, client, job_id, STEPS)
         assert len(state["began"]) == 2
         wait_until(lambda: len(process_tree(tree[0])) == 1, seconds=5.0)  # it waits for the next job
 
 
 @pytest.mark.slow
-def test_again_and_again(service: LiveService, scan: Path) -> None:
+def test_again_and_again(service: LiveService, scan: Path, tmp_path: Path) -> None:
+    """However long everything takes: the leases of those who live hold, and those of the killed end when they do."""
+    hurry, steps = tmp_path / "hurry", 9000
+    service.environment |= {"ADVTEX_LEASE_SECONDS": "20", "ADVTEX_ENGINE_HURRY": str(hurry)}
+    records = service.store.records
     with service.client() as client:
-        job_id, tree = begin(service, client, scan, steps=250)
-        for attempt in (2, 3, 4):
-            for pid in tree:
-                os.kill(pid, signal.SIGKILL)
-            worker = service.start_worker("stepping")
-            began = client.get_job(job_id).progress.step
-            wait_until(lambda: client.get_job(job_id).progress.step >= began + 15)  # noqa: B023
-            wait_until(lambda: client.get_job(job_id).attempt == attempt)  # noqa: B023
-            tree = process_tree(worker.pid)
-        state = assert_done_once(service, client, job_id, steps=250)
+        job_id = client.submit(scan, JobOptions(steps=steps)).id
+        for attempt in (1, 2, 3):
+            reached = records.job(job_id).reached
+            worker = service.start_worker("leisurely")
+            index = keys.checkpoint_prefix(job_id, attempt) + "index.json"
+            wait_until(lambda: records.job(job_id).reached > reached, 90)  # noqa: B023
+            wait_until(lambda: service.store.blobs.exists(index), 90)  # noqa: B023
+            assert records.job(job_id).attempt == attempt
+            kill_all(process_tree(worker.pid))
+            with service.store.database.write() as session:
+                session.get_one(JobRow, job_id).lease_expires_at = 0.0
+        hurry.touch()
+        service.start_worker("leisurely")
+        state = assert_done_once(service, client, job_id, steps)
         assert len(state["began"]) == 4
+        assert state["began"] == sorted(set(state["began"])), "each attempt went on from a checkpoint of the last"
 
 
 def test_cancel_stops_a_running_job_within_two_seconds_and_retry_goes_on(service: LiveService, scan: Path) -> None:
@@ -138,5 +137,5 @@ def test_cancel_stops_a_running_job_within_two_seconds_and_retry_goes_on(service
         reached = client.get_job(job_id).progress.step
         wait_until(lambda: len(process_tree(tree[0])) == 1, seconds=5.0)  # horse and runner are gone
         client.retry_job(job_id)
-        state = assert_done_once(service, client, job_id)
+        state = assert_done_once(service, client, job_id, STEPS)
         assert state["began"][1] >= reached

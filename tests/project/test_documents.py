@@ -38,6 +38,8 @@ IN_WORDS = {
     "SQLite in the data folder",
     "`blobs` in the data folder",
     "`work` in the data folder",
+    "`scans` in the data folder",
+    "20 GiB, if blobs are in S3",
 }
 IN_WORDS |= {"none", "the device's", "all cores"}
 

@@ -49,8 +49,20 @@ def test_the_client_calls_itself_by_it() -> None:
 
 def test_the_images_are_tagged_with_it() -> None:
     services = yaml.safe_load((ROOT / "compose.yaml").read_text(encoding="utf-8"))["services"]
-    built = {name: service["image"] for name, service in services.items() if "build" in service}
-    assert built == {name: f"advtex-{name}:{VERSION}" for name in ("server", "worker")}
+    built = {service["build"]["dockerfile"]: service["image"] for service in services.values() if "build" in service}
+    names = {path.name.partition(".")[0] for path in (ROOT / "docker").glob("*.Dockerfile")}
+    assert built == {f"docker/{name}.Dockerfile": f"advtex-{name}:{VERSION}" for name in names}
+    kustomization = yaml.safe_load((ROOT / "docker/kubernetes/kustomization.yaml").read_text(encoding="utf-8"))
+    assert kustomization["images"] == [{"name": f"advtex-{name}", "newTag": VERSION} for name in sorted(names)]
+
+
+def test_pages_name_images_by_it() -> None:
+    named = {
+        tag
+        for page in (ROOT / "README.md", *ROOT.glob("*/README.md"))
+        for tag in re.findall(r"advtex-(?:server|worker):([\w.]+)", page.read_text(encoding="utf-8"))
+    }
+    assert named == {VERSION}
 
 
 def test_the_citation_names_it() -> None:

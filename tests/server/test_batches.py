@@ -112,3 +112,55 @@ def test_batches_belong_to_their_owner(live: Any, scans: Path, is_error: Any) ->
         assert reader.get("/v1/batches/night").status_code == 200
         is_error(reader.post("/v1/batches/night/cancel"), 403, "forbidden")
     assert live.http.get("/v1/batches/night").json()["states"] == {"queued": 1}
+
+
+def test_a_batch_is_paused_and_resumed(live: Any, scans: Path, is_error: Any) -> None:
+    source = (scans / "good").as_uri()
+    runs, waits = (live.job(source=source, batch="night")["id"] for _ in range(2))
+    alone = live.job(source=source)["id"]
+    live.store.records.claim(runs, 1, "test")
+    paused = live.http.post("/v1/batches/night/pause").json()
+    assert (paused["paused"], paused["states"]) == (True, {"running": 1, "queued": 1})
+    assert live.http.get("/v1/batches").json()["batches"][0]["paused"]
+    assert "its batch is paused" in live.http.get(f"/v1/jobs/{waits}").json()["waiting_reason"]
+    reasons = {job["id"]: job["waiting_reason"] for job in live.http.get("/v1/jobs").json()["jobs"]}
+    assert [name for name, reason in reasons.items() if "paused" in reason] == [waits]
+    assert [job.id for job in live.store.records.waiting(10)] == [alone]
+    assert live.http.post("/v1/batches/night/pause").status_code == 200, "once more changes nothing"
+    with live.client(live.store.accounts.create_key("other")) as other:
+        is_error(other.post("/v1/batches/night/resume"), 404, "not_found")
+    with live.client(live.store.accounts.create_key(owner="me", scopes=["read"])) as reader:
+        is_error(reader.post("/v1/batches/night/resume"), 403, "forbidden")
+        is_error(reader.put("/v1/batches/night/limits", json={}), 403, "forbidden")
+    assert live.http.post("/v1/batches/night/resume").json()["paused"] is False
+    assert "paused" not in live.http.get(f"/v1/jobs/{waits}").json()["waiting_reason"]
+    assert {job.id for job in live.store.records.waiting(10)} == {waits, alone}
+    is_error(live.http.post("/v1/batches/none/pause"), 404, "not_found")
+
+
+@pytest.mark.one_machine("tests/store has the same on both databases")
+def test_how_many_jobs_of_a_batch_run_is_said_before_the_first(live: Any, scans: Path, is_error: Any) -> None:
+    assert live.http.put("/v1/batches/night/limits", json={"max_running": 1}).status_code == 204
+    is_error(live.http.put("/v1/batches/night/limits", json={"max_running": 0}), 422, "bad_request")
+    is_error(live.http.get("/v1/batches/night"), 404, "not_found")
+    for _ in range(2):
+        live.job(source=(scans / "good").as_uri(), batch="night")
+    assert live.http.get("/v1/batches/night").json()["max_running"] == 1
+    assert len(live.store.records.waiting(10)) == 1
+    live.http.put("/v1/batches/night/limits", json={})
+    assert len(live.store.records.waiting(10)) == 2
+
+
+@pytest.mark.one_machine("tests/store has the same on both databases")
+def test_a_job_is_shown_as_late_and_is_still_done(live: Any, scans: Path, is_error: Any) -> None:
+    source = (scans / "good").as_uri()
+    for deadline, late in (("2001-01-01T08:00:00Z", True), ("2101-01-01T08:00:00+02:00", False)):
+        body = {"source": source, "deadline": deadline}
+        made = live.http.post("/v1/jobs", json=body, headers={"Idempotency-Key": deadline}).json()
+        again = live.http.post("/v1/jobs", json=body, headers={"Idempotency-Key": deadline})
+        assert (again.status_code, again.json()["id"]) == (200, made["id"])
+        assert (made["late"], made["deadline"][:4]) == (late, deadline[:4])
+    other = {"source": source, "deadline": "2101-01-02T08:00:00Z"}
+    repeated = live.http.post("/v1/jobs", json=other, headers={"Idempotency-Key": deadline})
+    is_error(repeated, 422, "idempotency_mismatch")
+    is_error(live.http.post("/v1/jobs", json={"source": source, "deadline": "2101-01-02T08:00:00"}), 422, "bad_request")

@@ -266,8 +266,8 @@ def test_a_server_refuses_a_schema_that_it_does_not_know_with_a_sentence(
     run(tmp_path, "migrate")
     give_revision(f"sqlite:///{tmp_path}/advtex.db", "9901")
     environment = {**os.environ, "ADVTEX_DATA_DIR": str(tmp_path), "ADVTEX_REDIS_URL": "redis://127.0.0.1:1/0"}
-    for command in ("serve", "up"):
-        started = [*COMMAND, command, "--port", "0"]
+    for arguments in (("serve", "--port", "0"), ("up", "--port", "0"), ("dispatch",)):
+        started = [*COMMAND, *arguments]
         ended = subprocess.run(started, env=environment, capture_output=True, text=True, timeout=30)
         assert ended.returncode == 1
         assert ended.stderr.startswith("advtex-server: the database has schema 9901, which this release does not know")
@@ -282,13 +282,15 @@ def test_keys_are_limited_and_rotated(tmp_path: Path, run: Callable[..., Result]
     def rows() -> list[dict[str, Any]]:
         return [json.loads(line) for line in run(tmp_path, "keys", "list").stdout.splitlines()]
 
-    limits = ("--max-active-jobs", "2", "--max-bytes", "1000")
+    limits = ("--max-active-jobs", "2", "--max-bytes", "1000", "--max-running-jobs", "1")
     key = run(tmp_path, "keys", "create", "ada", "--owner", "team", *limits).stdout.strip()
     (row,) = rows()
     assert (row["owner"], row["max_active_jobs"], row["max_bytes"]) == ("team", 2, 1000)
+    assert row["max_running_jobs"] == 1
     assert (row["active_jobs"], row["bytes"]) == (0, 0)
     assert run(tmp_path, "keys", "limit", row["id"], "--max-active-jobs", "5").exit_code == 0
-    assert [(r["max_active_jobs"], r["max_bytes"]) for r in rows()] == [(5, None)]
+    assert [(r["max_active_jobs"], r["max_bytes"], r["max_running_jobs"]) for r in rows()] == [(5, None, None)]
+    assert run(tmp_path, "keys", "limit", row["id"], "--max-active-jobs", "5", "--max-running-jobs", "3").exit_code == 0
 
     now = time.time()
     new = run(tmp_path, "keys", "rotate", row["id"], "--keep-hours", "2").stdout.strip()
@@ -298,7 +300,7 @@ def test_keys_are_limited_and_rotated(tmp_path: Path, run: Callable[..., Result]
     assert abs(old["expires_at"] - now - 7200) < 60
     assert (fresh["id"], fresh["expires_at"]) == (new.split("_")[1], None)
     assert all(fresh[name] == row[name] for name in ("name", "owner", "scopes"))
-    assert (fresh["max_active_jobs"], fresh["max_bytes"]) == (5, None)
+    assert (fresh["max_active_jobs"], fresh["max_bytes"], fresh["max_running_jobs"]) == (5, None, 3)
     run(tmp_path, "keys", "rotate", fresh["id"])
     assert rows()[1]["expires_at"] <= time.time()
 

@@ -38,10 +38,10 @@ def settings(store: Store, **values: Any) -> ServerSettings:
     return store.settings.model_copy(update=values)
 
 
-def submit(store: Store, owner: str = "me", *, gib: int = 0, priority: int = 0) -> str:
+def submit(store: Store, owner: str = "me", *, gib: int = 0, priority: int = 0, batch: str | None = None) -> str:
     upload = store.uploads.create(owner, 3)
     store.uploads.finish(upload.id, "ab" * 32)
-    spec = JobSpec(upload_id=upload.id, priority=priority)
+    spec = JobSpec(upload_id=upload.id, priority=priority, batch=batch)
     return queued_job(store, owner, spec, gib << 30)
 
 
@@ -308,3 +308,50 @@ def test_what_a_worker_declined_keeps_nobody_waiting(store: Store, monkeypatch: 
     monkeypatch.setattr(queue.time, "time", lambda: now + queue.DECLINED_SECONDS + 1)
     dispatcher.dispatch()
     assert in_redis(store) == [f"{declined[0]}-1"]
+
+
+def test_what_was_offered_of_a_batch_comes_back_when_it_is_paused(store: Store) -> None:
+    """And other jobs take the places; after a restart too, as it is in the rows."""
+    night = [submit(store, batch="night") for _ in range(3)]
+    other = submit(store)
+    only_workers(store, GIB, GIB)
+    Dispatcher(store, settings(store)).dispatch()
+    assert in_redis(store) == [f"{job}-1" for job in night[:1]] + [f"{other}-1"]
+    store.batches.pause("me", "night", True)
+    Dispatcher(store, settings(store)).dispatch()
+    assert in_redis(store) == [f"{other}-1"]
+    store.batches.pause("me", "night", False)
+    Dispatcher(store, settings(store)).dispatch()
+    assert in_redis(store) == [f"{other}-1", f"{night[0]}-1"]
+
+
+@pytest.mark.parametrize("limited", ["batch", "owner"])
+def test_no_more_jobs_are_on_their_way_than_may_run(store: Store, limited: str) -> None:
+    """Also where each class of workers would begin with another one, and one more urgent comes later."""
+    if limited == "batch":
+        store.batches.limit("me", "night", 2)
+    else:
+        store.accounts.create_key(owner="me", max_running_jobs=2)
+    only_workers(store, GIB, GIB, GIB, 3 * GIB, 3 * GIB)
+    submit(store, gib=2 * GIB, batch="night")
+    small = [submit(store, batch="night") for _ in range(4)]
+    theirs = submit(store, "somebody else", batch="night")
+    dispatcher = Dispatcher(store, settings(store))
+
+    def on_their_way() -> list[str]:
+        names = in_redis(store) + in_redis(store, 3 * GIB)
+        return [name.rpartition("-")[0] for name in names if name != f"{theirs}-1"]
+
+    dispatcher.dispatch()
+    assert on_their_way() == small[:2]
+    submit(store, priority=50, gib=2 * GIB, batch="night")
+    dispatcher.dispatch()
+    assert on_their_way() == small[:2]
+    assert f"{theirs}-1" in in_redis(store), "others are not held up"
+    store.queue.redis.lrem(f"rq:queue:{queue_name(GIB)}", 1, f"{small[0]}-1")
+    store.records.claim(small[0], 1, "w")
+    dispatcher.dispatch()
+    assert on_their_way() == small[1:2]
+    store.records.succeed(small[0], 1, [])
+    dispatcher.dispatch()
+    assert len(on_their_way()) == 2

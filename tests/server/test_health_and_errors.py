@@ -8,11 +8,13 @@ from typing import Any
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
+from sqlalchemy import update
 
 from advtex_contract.errors import ErrorCode
 from advtex_contract.jobs import Progress
 from advtex_server.ranges import chosen_range
 from advtex_server.refusal import STATUS
+from advtex_store.models import JobRow
 
 
 def test_every_code_has_a_status() -> None:
@@ -170,6 +172,26 @@ def test_metrics_of_the_fleet(make_live: Callable[..., Any], redis_url: str, sca
     assert 'advtex_stage_seconds_count{stage="ingest"} 1.0' in told
     assert 'advtex_stage_seconds_sum{stage="ingest"} 4.0' in told
     assert 'advtex_jobs_ended_total{state="succeeded"} 1.0' in told
+
+
+def test_jobs_that_wait_are_told_by_the_class_that_they_need(make_live: Callable[..., Any], scan_zip: Path) -> None:
+    live = make_live()
+    upload = live.upload(scan_zip.read_bytes())
+    small = [live.job(upload)["id"] for _ in range(2)]
+    large = live.job(upload)["id"]
+    running = live.job(upload)["id"]
+    with live.store.database.write() as session:
+        session.execute(update(JobRow).where(JobRow.id == large).values(memory_bytes=(11 << 30) + 1))
+    for job in (small[0], running):
+        live.store.records.claim(job, 1, "w")
+    live.store.records.preempt(small[0], 1)
+    told = live.http.get("/metrics").text.splitlines()
+    gib = live.store.records.job(small[0]).memory_gib
+    assert f'advtex_jobs_waiting{{memory_gib="{gib}"}} 2.0' in told
+    assert 'advtex_jobs_waiting{memory_gib="12"} 1.0' in told
+    ages = [float(line.split()[1]) for line in told if line.startswith("advtex_jobs_waiting_oldest_seconds{")]
+    assert len(ages) == 2
+    assert 0 < min(ages) < max(ages) < 60
 
 
 @pytest.mark.one_machine("tests/store has the same on both databases")

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from advtex_contract.jobs import JobState, Progress
-from advtex_store.batches import remaining_seconds
+from advtex_store.batches import UNUSED_SECONDS, remaining_seconds
 from advtex_store.errors import RecordNotFound
 
 S = JobState
@@ -80,6 +80,28 @@ def test_the_time_left_comes_from_the_rows(bench: Any) -> None:
     bench.records.heartbeat(jobs[0], 1, done)
     bench.records.succeed(jobs[0], 1, [])
     assert bench.batches.batch(bench.owner, "night").eta_seconds == 4 * 20.0
+
+
+def test_what_was_said_of_a_batch_goes_with_its_last_job(bench: Any) -> None:
+    job = bench.job(batch="night")
+    bench.batches.pause(bench.owner, "night", True)
+    bench.batches.limit(bench.owner, "later", 3)
+    with pytest.raises(RecordNotFound):
+        bench.batches.pause(bench.owner, "none", True)
+    bench.clock.now += 2 * UNUSED_SECONDS
+    bench.batches.limit(bench.owner, "night", 2)
+    bench.batches.forget()
+    batch = bench.batches.batch(bench.owner, "night")
+    assert (batch.paused, batch.max_running) == (True, 2)
+    bench.records.cancel(job)
+    bench.records.delete(job)
+    bench.clock.now += 2 * UNUSED_SECONDS
+    bench.batches.forget()
+    bench.job(batch="night")
+    batch = bench.batches.batch(bench.owner, "night")
+    assert (batch.paused, batch.max_running) == (False, None)
+    bench.job(batch="later")
+    assert bench.batches.batch(bench.owner, "later").max_running is None
 
 
 QUICK, LONG = {"preset": "preview", "seed": 0}, {"preset": "full", "seed": 0}

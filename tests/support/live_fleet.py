@@ -50,6 +50,7 @@ class Fleet:
         workers: int,
         engine: str,
         variables: Mapping[str, str],
+        dispatch: bool,
     ) -> None:
         self.place = place
         self.log, self.redis_log = folder / "fleet.log", folder / "redis.log"
@@ -69,6 +70,8 @@ class Fleet:
         self.servers: list[subprocess.Popen[bytes]] = []
         self.workers: list[subprocess.Popen[bytes]] = []
         self._workers = workers
+        self._dispatch = dispatch
+        self._dispatchers: list[subprocess.Popen[bytes]] = []
         for name, value in (place.s3 or {}).items():
             os.environ[name] = value  # for the store of the test's own process; `fleet` puts them back
         self.settings = StoreSettings(
@@ -99,8 +102,15 @@ class Fleet:
 
     def start_server(self, number: int, release: Release = PRESENT) -> subprocess.Popen[bytes]:
         command = [release.python, "-m", "advtex_server.main", "serve", "--host", "127.0.0.1"]
-        variables = self._variables(lambda _name, url: url)
-        return self._start([*command, "--port", str(self.ports[number])], variables, release)
+        command += ["--port", str(self.ports[number])]
+        if not self._dispatch:
+            command.append("--no-dispatch")
+        return self._start(command, self._server_variables(f"server-{number}"), release)
+
+    def start_dispatcher(self) -> subprocess.Popen[bytes]:
+        command = [PRESENT.python, "-m", "advtex_server.main", "dispatch"]
+        self._dispatchers.append(self._start(command, self._server_variables("dispatcher")))
+        return self._dispatchers[-1]
 
     def start_worker(self, number: int, release: Release = PRESENT) -> subprocess.Popen[bytes]:
         """Its lines to Redis, database and object storage go through `lines`."""
@@ -116,9 +126,16 @@ class Fleet:
 
     def stop(self) -> None:
         self.store.close()
-        for process in (*self.workers, *self.servers, self.redis):
+        for process in (*self.workers, *self.servers, *self._dispatchers, self.redis):
             kill_tree(process.pid)
             process.wait()
+
+    def _server_variables(self, name: str) -> dict[str, str]:
+        """Where rows and blobs are elsewhere, it shares no folder with any other."""
+        variables = self._variables(lambda _name, url: url)
+        if self.place.database_url and self.place.blob_url:
+            variables["ADVTEX_DATA_DIR"] = str(self.place.data / name)
+        return variables
 
     def _variables(self, url_for: Callable[[str, str], str]) -> dict[str, str]:
         s3 = dict(self.place.s3 or {})
@@ -154,11 +171,22 @@ def fleet(
     workers: int = 3,
     engine: str,
     variables: Mapping[str, str] = MappingProxyType({}),
+    dispatch: bool = True,
 ) -> Iterator[Fleet]:
-    """Started, and stopped at the end with everything it has started. `variables`: settings of all its processes."""
+    """Started, and stopped at the end with everything it has started. `variables`: settings of all its processes.
+    `dispatch`: whether the servers do; else `start_dispatcher` starts one that does nothing else."""
     with ExitStack() as stack:
         before = dict(os.environ)
-        running = Fleet(folder, place, stack, servers=servers, workers=workers, engine=engine, variables=variables)
+        running = Fleet(
+            folder,
+            place,
+            stack,
+            servers=servers,
+            workers=workers,
+            engine=engine,
+            variables=variables,
+            dispatch=dispatch,
+        )
         try:
             running.start()
             yield running

@@ -86,8 +86,8 @@ class LiveService:
             wait_until(lambda: _answers(client))
         return process
 
-    def start_worker(self, engine: str) -> subprocess.Popen[bytes]:
-        return self._start([sys.executable, str(SUPPORT / "run_worker.py"), engine])
+    def start_worker(self, engine: str, *arguments: str) -> subprocess.Popen[bytes]:
+        return self._start([sys.executable, str(SUPPORT / "run_worker.py"), engine, *arguments])
 
     def restart_server(self) -> None:
         """A new server process, at another address, after the old one was killed."""

@@ -23,7 +23,7 @@ sys.path.insert(0, str(SUPPORT))
 @pytest.fixture
 def settings(tmp_path: Path, place: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> WorkerSettings:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([*sys.path, str(SUPPORT)]))
-    rhythm = {"lease_seconds": 3.0, "grace_seconds": 1.0, "heartbeat_seconds": 0.05}
+    rhythm = {"lease_seconds": 10.0, "grace_seconds": 1.0, "heartbeat_seconds": 0.05}
     return WorkerSettings(data_dir=tmp_path / "data", device="cpu", threads=1, **rhythm, **place)
 
 

@@ -90,4 +90,4 @@ def test_every_line_about_a_job_names_it(
         assert mine == list(range(mine[0], mine[-1] + 1)), "a line in between does not name the job"
         assert {lines[number]["attempt"] for number in mine} == {1}
     assert {line["job"] for line in lines if line["logger"] == "rq.worker"} == {killed}
-    assert [line["event"] for line in lines if "job" not in line] == ["worker takes jobs"]
+    assert [line["event"] for line in lines if "job" not in line] == ["worker takes jobs", "worker ends"]

@@ -121,10 +121,12 @@ import sys
 from pathlib import Path
 from advtex_store import supervision
 from advtex_worker import slots
+from advtex_worker.leaving import Departure, Stay
 from advtex_worker.settings import WorkerSettings
 supervision.RESTART_SECONDS = (0.1,)
 settings = WorkerSettings(data_dir=Path("/nowhere"))
-slots.supervise([sys.executable, "-c", sys.argv[2], sys.argv[1]], slots.find_slots(settings), settings)
+departure = Departure(Stay(), settings.grace_seconds)
+slots.supervise([sys.executable, "-c", sys.argv[2], sys.argv[1]], slots.find_slots(settings), settings, departure)
 """
 
 

@@ -21,7 +21,6 @@ from advtex_engine.mesh import MAX_FRAMES, fuse, register_mesh
 from advtex_engine.methods import require, texture_function
 from advtex_engine.metrics.speckle import speckle_share
 from advtex_engine.previews.curves import curves
-from advtex_engine.render import fill_holes
 from advtex_engine.results import (
     assembled,
     describe_scene,
@@ -30,17 +29,20 @@ from advtex_engine.results import (
     write_gallery,
     write_page,
     write_report,
+    write_seen,
 )
 from advtex_engine.runtime import Stages, WorkFolder, choose_device
 from advtex_engine.stages import (
     MadeScene,
     cached_scene,
+    completed_model,
     fingerprint,
     fitting_atlas,
     fitting_view_maps,
     method_input,
     refined_scene,
 )
+from advtex_options.box import parse_box
 
 
 @dataclass(frozen=True)
@@ -93,11 +95,14 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
     memory = budget.report(work, stages.records[-1])
     touched, mean = maps[1].slot_map >= 0, given.means[1]
     with stages.run("dilation"):
-        texture = fill_holes(texture, touched)
+        seen = touched & given.facts.get("known", touched)
+        atlas, completed = completed_model(atlas, texture, seen, made["mesh"]["made_up_faces"], config)
+    texture = completed.texture
     with stages.run("export"):
         files = export_model(out, atlas, texture, up_axis=scene.up_axis, lossless=config.lossless, usdz=True)
+        files += write_seen(out, atlas, completed.state)
     with stages.run("previews"):
-        files += write_gallery(out, scene, atlas, texture, mean, curves(losses, given.live.quality))
+        files += write_gallery(out, scene, atlas, texture, mean, curves(losses, given.live.quality), completed.state)
         atlas = replace(atlas, mesh=atlas.mesh.to(torch.device("cpu")))
         scores = heldout_scores(scene, atlas, texture.cpu(), mean.cpu())
     parts = {
@@ -106,6 +111,7 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
         "refinement": refinement and refinement | given.facts.get("refinement", {}),
         "atlas": {key: getattr(atlas, key) for key in ("width", "height", "source", "charts", "pages")},
         "touched_texels": maps[1].slots,
+        "surface": completed.shares,
         "speckled_texels": speckle_share(texture, touched),
         "stages": stages.records,
         "saving_seconds": round(sum(folder.seconds for folder in {budget.folder, given.work}), 3),
@@ -125,19 +131,24 @@ def _scene(
     """The scene, mesh and views within their budgets, and the report's parts about how it was made."""
     monitor = stages.monitor
     made: dict[str, Any] = {"conventions": None, "fusion": None, "registration": None}
-    with MeshPreparation(config.face_budget, charts) as preparation:
+    box = None if config.box is None else parse_box(config.box)
+    with MeshPreparation(config.face_budget, charts, box=box, holes=config.close_holes) as preparation:
         with stages.run("ingest"):
             capture = read_capture(
-                scan, config, store, monitor, lambda mesh, moves: preparation.begin(mesh, moves=moves != "none")
+                scan,
+                config,
+                store,
+                monitor,
+                lambda mesh, moves, up: preparation.begin(mesh, up_axis=up, moves=moves != "none"),
             )
         with stages.run("conventions"):
             made["conventions"] = checked_conventions(scan, capture.manifest, capture.mesh, monitor)
         if capture.mesh is None:
             with stages.run("fusion"):
                 fused, made["fusion"] = fuse(capture.measured(), device, monitor)
-            preparation.begin(fused)
+            preparation.begin(fused, up_axis=capture.up_axis)
         with stages.run("geometry"):
-            mesh = preparation.result(monitor)
+            mesh, made["mesh"] = preparation.result(monitor)
             capture, made["view_choice"] = capture.choose(mesh, config.max_views, monitor)
             scene = capture.scene(mesh, monitor)
             if capture.mesh_refinement != "none" and (frames := capture.measured(MAX_FRAMES)):

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import fcntl
 import math
-import os
-import shutil
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future, wait
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import ExitStack, suppress
 from functools import partial
-from pathlib import Path
-from typing import TypeVar
+from typing import IO, TypeVar
 
 import structlog
 from sqlalchemy.exc import SQLAlchemyError
@@ -36,6 +31,7 @@ from advtex_store.files import translated
 from advtex_store.process_ends import how_it_ended
 from advtex_store.records import Claim
 from advtex_store.store import Store
+from advtex_worker.ahead import Ahead
 from advtex_worker.checkpoints import CheckpointUploader, restore
 from advtex_worker.child import Child
 from advtex_worker.events import (
@@ -54,15 +50,16 @@ from advtex_worker.events import (
 from advtex_worker.lease import Ending, LeaseKeeper
 from advtex_worker.live import LivePoster
 from advtex_worker.progress import ProgressTracker
+from advtex_worker.scan_cache import ScanCache, cache_name
 from advtex_worker.settings import WorkerSettings
 from advtex_worker.tracing import NOT_TRACED, AttemptTrace
+from advtex_worker.workspace import workspace_of
 
 RETRY_SECONDS = 5.0
 KILL_SECONDS = 1.0  # after a cancel: a runner whose interpreter is held by native code does not hear it
 POLL_SECONDS = 0.05
 REASON_LENGTH = 120
 RECORD_SECONDS = 1.2  # after a cancel: what is not in the storage by then stays out of it
-WORKSPACE = "attempt-"  # what the names of workspaces begin with; other folders beside them are nobody's business here
 
 T = TypeVar("T")
 log = structlog.get_logger()
@@ -76,72 +73,20 @@ class Refused(Exception):
     """The storage has refused what the attempt needs for too long."""
 
 
-@dataclass(frozen=True)
-class Workspace:
-    """The folders of one attempt. `snapshots` lies beside `work`, so that hard links reach it."""
-
-    root: Path
-
-    @property
-    def scan(self) -> Path:
-        return self.root / "scan.zip"
-
-    @property
-    def work(self) -> Path:
-        return self.root / "work"
-
-    @property
-    def snapshots(self) -> Path:
-        return self.root / "snapshots"
-
-    @property
-    def out(self) -> Path:
-        return self.root / "out"
-
-    @property
-    def log(self) -> Path:
-        return self.root / "engine.log"
-
-    @contextmanager
-    def made(self) -> Iterator[None]:
-        """Empty folders, gone at the end. OSError when `sweep` came in between: try again."""
-        self.root.mkdir(parents=True, exist_ok=True)
-        with self.held():
-            try:
-                for folder in (self.work, self.snapshots, self.out):
-                    folder.mkdir()
-                yield
-            finally:
-                shutil.rmtree(self.root, ignore_errors=True)
-
-    @contextmanager
-    def held(self) -> Iterator[None]:
-        """Keep `sweep` away, until this process ends at the latest."""
-        handle = os.open(self.root, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            yield
-        finally:
-            os.close(handle)
-
-    def results(self) -> dict[str, Path]:
-        """Everything in the out folder, by its name there."""
-        files = (path for path in sorted(self.out.rglob("*")) if path.is_file())
-        return {path.relative_to(self.out).as_posix(): path for path in files}
-
-
-def sweep(workspaces: Path) -> None:
-    """Remove what killed attempts left behind."""
-    for root in workspaces.glob(f"{WORKSPACE}*/"):
-        with suppress(OSError), Workspace(root).held():  # BlockingIOError: it is in use
-            shutil.rmtree(root, ignore_errors=True)
-
-
 class Attempt:
-    """Carries a claimed job to one of its ends. `stop` may be called at any time, also from a signal handler."""
+    """Carries a claimed job to one of its ends. `stop` may be called at any time, also from a signal handler.
+
+    gib: the class of its worker; None where it belongs to none, and nothing is downloaded ahead.
+    """
 
     def __init__(
-        self, store: Store, settings: WorkerSettings, engine: str, claim: Claim, trace: AttemptTrace = NOT_TRACED
+        self,
+        store: Store,
+        settings: WorkerSettings,
+        engine: str,
+        claim: Claim,
+        gib: int | None = None,
+        trace: AttemptTrace = NOT_TRACED,
     ) -> None:
         self._store = store
         self._trace = trace
@@ -150,8 +95,11 @@ class Attempt:
         self._job_id = claim.job_id
         self._number = claim.attempt
         self._claim = claim
-        self._space = Workspace(settings.workspaces / f"{WORKSPACE}{claim.job_id}-{claim.attempt}")
+        self._space = workspace_of(settings.workspaces, claim.job_id, claim.attempt)
         self._scan = self._space.scan
+        self._cache = ScanCache(settings.scan_cache, settings.cached_bytes)
+        self._ahead = None if gib is None or self._cache.limit_bytes == 0 else Ahead(store, self._cache, gib)
+        self._stack = ExitStack()  # of what is held for as long as the attempt lasts
         self._keeper = LeaseKeeper(
             store.records,
             claim.job_id,
@@ -187,8 +135,8 @@ class Attempt:
         try:
             if self._persist(lambda: self._store.results.adopt(self._job_id)):
                 return
-            with ExitStack() as stack:
-                self._persist(lambda: stack.enter_context(self._space.made()))
+            with self._stack:
+                self._persist(lambda: self._stack.enter_context(self._space.made()))
                 self._run()
         except Interrupted:
             self._give_back()
@@ -204,6 +152,9 @@ class Attempt:
             error = JobError(code="scan_missing", message=str(missing) if self._claim.source else message)
             self._record(lambda: self._store.records.fail(self._job_id, self._number, error))
             return
+        if self._ahead is not None:
+            self._ahead.start()
+            self._stack.callback(self._ahead.stop)
         base = self._transfer(lambda: restore(self._store.blobs, self._job_id, self._number, self._space.work))
         self._check_ending()
         self._warnings = base.warnings
@@ -232,11 +183,17 @@ class Attempt:
         if self._claim.source is not None:
             folder = self._space.root / "source"
             self._scan = self._store.references.fetch(self._claim.source, folder, self._check_ending)
-            return
-        with self._scan.open("wb") as file:
-            for chunk in self._store.blobs.stream(self._claim.scan_key):
-                file.write(chunk)
-                self._check_ending()
+        elif self._cache.limit_bytes > 0:
+            name = cache_name(self._claim.upload_id)
+            self._scan = self._stack.enter_context(self._cache.held(name, self._download, self._check_ending))
+        else:
+            with self._scan.open("wb") as file:
+                self._download(file)
+
+    def _download(self, file: IO[bytes]) -> None:
+        for chunk in self._store.blobs.stream(self._claim.scan_key):
+            file.write(chunk)
+            self._check_ending()
 
     def _check_ending(self) -> None:
         if self._keeper.ending:
@@ -285,6 +242,7 @@ class Attempt:
                 case CheckpointEvent():
                     uploader.add(event.files, self._warnings)
                 case DiskFullEvent():
+                    self._cache.shrink(0)
                     self._keeper.paused = self._no_room(f"{self._settings.workspaces}")
                     continue
                 case _:
@@ -409,6 +367,8 @@ class Attempt:
             except (OSError, StoreError, SQLAlchemyError) as error:
                 if _is_answer(error):
                     raise
+                if _is_disk_full(error):
+                    self._cache.shrink(0)
                 self._keeper.paused = self._why_paused(error)
                 self._log.warning("storage is in trouble, trying again", error=f"{type(error).__name__}: {error}")
                 refused_at = min(refused_at, time.monotonic()) if _is_refusal(error) else math.inf

@@ -9,11 +9,14 @@ from pydantic import Field
 
 from advtex_store.settings import StoreSettings
 
+CACHE_BYTES = 20 << 30
+
 
 class WorkerSettings(StoreSettings):
     """Settings of one worker.
 
     work_dir: scratch space of running attempts, `<data_dir>/work` by default.
+    cache_dir: of downloaded scans, `<data_dir>/scans` by default; workers of one machine may share it.
     gpu: set for the processes that a worker starts for each of its GPUs; set by hand, this process takes one job at a
     time, on that GPU. GPUs in `device` have nvidia-smi's numbers.
     """
@@ -23,6 +26,10 @@ class WorkerSettings(StoreSettings):
     jobs_per_gpu: int = Field(default=1, ge=1, le=64, description="at a time; they share its memory evenly")
     memory_bytes: int | None = Field(default=None, gt=0, description="what a job may use; the device's by default")
     work_dir: Path | None = None
+    cache_dir: Path | None = None
+    cache_bytes: int | None = Field(
+        default=None, ge=0, description="of scans that are kept; by default 20 GiB, and none where blobs are a folder"
+    )
     threads: int = Field(default_factory=lambda: len(os.sched_getaffinity(0)), ge=1, description="of the engine")
     grace_seconds: float = Field(default=30.0, gt=0, description="a runner that was asked to stop is killed after this")
     refused_seconds: float = Field(
@@ -37,3 +44,15 @@ class WorkerSettings(StoreSettings):
     def workspaces(self) -> Path:
         """The folder that holds one folder per running attempt."""
         return self.work_dir or self.data_dir / "work"
+
+    @property
+    def scan_cache(self) -> Path:
+        """The folder of scans that were downloaded."""
+        return self.cache_dir or self.data_dir / "scans"
+
+    @property
+    def cached_bytes(self) -> int:
+        """How much of them is kept. A folder is near enough."""
+        if self.cache_bytes is not None:
+            return self.cache_bytes
+        return 0 if self.blobs.startswith("file:") else CACHE_BYTES

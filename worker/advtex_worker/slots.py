@@ -18,6 +18,7 @@ from typing import IO
 import structlog
 
 from advtex_store.supervision import Supervised
+from advtex_worker.leaving import STOP_SIGNALS, Departure
 from advtex_worker.locks import first_lock, lock_paths
 from advtex_worker.memory import list_gpus, usable_memory
 from advtex_worker.settings import WorkerSettings
@@ -78,24 +79,28 @@ def hold(slot: Slot, jobs: int, wait: Callable[[float], object]) -> IO[bytes] | 
     return lock
 
 
-def supervise(command: Sequence[str], slots: Sequence[Slot], settings: WorkerSettings) -> None:
-    """One process per slot, started again when it dies, until SIGTERM or SIGINT; each then gives its job back."""
+def supervise(command: Sequence[str], slots: Sequence[Slot], settings: WorkerSettings, departure: Departure) -> None:
+    """One process per slot, started again when it dies, until a signal comes or the stay is over; each then gives its
+    job back. Where slots may end by themselves, those that have are not started again."""
     environments = [_environment(settings_of(slot, settings, len(slots))) for slot in slots]
     children = [Supervised(f"slot {number}", command, told) for number, told in enumerate(environments)]
-    stopping = False
 
-    def stop(_signum: int, _frame: FrameType | None) -> None:
-        nonlocal stopping
-        stopping = True
+    def stop(signum: int, _frame: FrameType | None) -> None:
+        departure.begin_on_signal(signum)
 
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in STOP_SIGNALS:
         signal.signal(number, stop)
+    if departure.is_due():
+        return
     for child in children:
         child.start()
-    while not stopping:
-        for child in children:
+    staying = children
+    while staying and not departure.is_due():
+        for child in staying:
             child.watch()
         time.sleep(POLL_SECONDS)
+        if departure.stay.is_short:
+            staying = [child for child in staying if child.exit_code != 0]
     for child in children:
         child.ask_to_stop()
     for child in children:
@@ -103,7 +108,9 @@ def supervise(command: Sequence[str], slots: Sequence[Slot], settings: WorkerSet
 
 
 def _environment(settings: WorkerSettings) -> dict[str, str]:
-    told = os.environ | {"ADVTEX_GPU": settings.gpu or "", "ADVTEX_THREADS": str(settings.threads)}
+    told = os.environ | {"ADVTEX_THREADS": str(settings.threads)}
+    if settings.gpu is not None:
+        told["ADVTEX_GPU"] = settings.gpu
     if settings.memory_bytes is not None:
         told["ADVTEX_MEMORY_BYTES"] = str(settings.memory_bytes)
     return told

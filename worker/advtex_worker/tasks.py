@@ -14,10 +14,11 @@ import structlog
 
 from advtex_store.errors import NotUnderstood, RecordNotFound, StaleAttempt
 from advtex_store.store import open_store
-from advtex_worker.attempt import Attempt, sweep
+from advtex_worker.attempt import Attempt
 from advtex_worker.runner import ENGINE
 from advtex_worker.settings import WorkerSettings
 from advtex_worker.tracing import traced
+from advtex_worker.workspace import sweep
 
 log = structlog.get_logger()
 
@@ -45,11 +46,12 @@ class StopSignal:
 
 @dataclass(frozen=True)
 class Host:
-    """What a worker gives to each attempt. `engine` is `module:function` (`events.Request`)."""
+    """What a worker gives to each attempt. `engine` is `module:function` (`events.Request`), `gib` its own class."""
 
     settings: WorkerSettings
     engine: str = ENGINE
     stop_signal: StopSignal = field(default_factory=StopSignal)
+    gib: int | None = None
 
 
 _host: Host | None = None
@@ -80,7 +82,7 @@ def run_attempt(host: Host, job_id: str, attempt: int) -> None:
         store.queue.decline(job_id, attempt)
     else:
         with traced(store, claim) as trace:
-            carried = Attempt(store, host.settings, host.engine, claim, trace)
+            carried = Attempt(store, host.settings, host.engine, claim, host.gib, trace)
             host.stop_signal.watch(carried)
             try:
                 carried.carry()

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Query, Response
 
 from advtex_contract.errors import ErrorCode
-from advtex_contract.jobs import BatchId, BatchPage, BatchView
+from advtex_contract.jobs import BatchId, BatchLimits, BatchPage, BatchView
 from advtex_server.deps import Reader, TheService, Writer
 from advtex_server.refusal import WITH_KEY, refuses
 
@@ -37,6 +37,25 @@ def get_batch(batch_id: BatchId, caller: Reader, service: TheService) -> BatchVi
 def cancel_batch(batch_id: BatchId, caller: Writer, service: TheService) -> BatchView:
     """Cancel every job that has not ended."""
     return service.batches.cancel(caller.owner, batch_id)
+
+
+@router.post("/{batch_id}/pause", responses=OF_A_BATCH)
+def pause_batch(batch_id: BatchId, caller: Writer, service: TheService) -> BatchView:
+    """Keep every job that waits waiting, until the batch is resumed. What runs goes on."""
+    return service.batches.pause(caller.owner, batch_id, True)
+
+
+@router.post("/{batch_id}/resume", responses=OF_A_BATCH)
+def resume_batch(batch_id: BatchId, caller: Writer, service: TheService) -> BatchView:
+    """Let the jobs of a paused batch begin again, each when its turn comes."""
+    return service.batches.pause(caller.owner, batch_id, False)
+
+
+@router.put("/{batch_id}/limits", status_code=204, responses=refuses(ErrorCode.bad_request, 422))
+def limit_batch(batch_id: BatchId, limits: BatchLimits, caller: Writer, service: TheService) -> Response:
+    """Say how many of its jobs run at a time, also before the first one is made."""
+    service.batches.limit(caller.owner, batch_id, limits)
+    return Response(status_code=204)
 
 
 @router.post(

@@ -101,9 +101,10 @@ function showBatch(batch) {
   place.hidden = false;
   place.replaceChildren(
     el("h2", {}, `Batch ${batch.id}`), share(batch),
-    el("p", {}, [`${count(batch.jobs)} ${batch.jobs === 1 ? "job" : "jobs"}: ${counts(batch)}`, left].filter(Boolean).join("; ")),
+    el("p", {}, [`${count(batch.jobs)} ${batch.jobs === 1 ? "job" : "jobs"}: ${counts(batch)}`, left, batch.paused && "paused"].filter(Boolean).join("; ")),
     el("div", { class: "actions" },
       batch.states.failed && act("Retry the failed ones", `${path}/retry-failed`),
+      !batch.finished && (batch.paused ? act("Resume", `${path}/resume`) : act("Pause", `${path}/pause`)),
       !batch.finished && act("Cancel all", `${path}/cancel`,
         ["Cancel the whole batch?", "Every job that has not ended is stopped.", "Cancel all"])));
 }

@@ -4,6 +4,7 @@ import { showAtlas } from "./atlas.js";
 import { bytes, count, duration, el, findings, stageName } from "./base.js";
 import { showComparison } from "./compare.js";
 import { showCurves } from "./chart.js";
+import { showModel } from "./viewer.js";
 
 const FILES = {
   "model.glb": "One file; for viewers, game engines, the web", "model.usdz": "One file; for AR on iPhone and iPad", "model.obj": "Geometry; needs the .mtl and the textures",
@@ -18,7 +19,6 @@ const SCORES = {
   s3_ratio: ["S3 ratio", "perceived sharpness beside the photographs; 1 is best"],
   coverage: ["Coverage", "share of the pixels that show the model"],
 };
-const PATIENCE_MS = 15000;
 const byId = (id) => document.getElementById(id);
 let drawn = false;
 
@@ -37,8 +37,7 @@ export async function showResult(job) {
   showDownloads(job.results);
   const [manifest, report] = await Promise.all([
     loaded(address("previews/manifest.json")).catch(() => null), loaded(address("report.json")).catch(() => null)]);
-  const turntable = (manifest?.turntable ?? []).map(address).filter(Boolean);
-  showModel(address("model.glb"), turntable, address(manifest?.thumbnail), manifest?.orbit);
+  showModel(byId("model"), manifest, address);
   if (manifest) {
     showComparison(byId("compare"), manifest.views ?? [], address);
     showAtlas(byId("atlas"), manifest.atlas ?? [], address);
@@ -49,50 +48,6 @@ export async function showResult(job) {
     showScores(report.heldout);
   }
   showScan(job, report);
-}
-
-function showModel(url, turntable, thumbnail, orbit) {
-  const section = byId("model");
-  const stage = el("div", { class: "stage" });
-  section.append(stage);
-  if (!url) {
-    stage.append(el("p", { class: "wait" }, "There is no model.glb in this result."));
-    return;
-  }
-  const wait = el("p", { class: "wait", role: "status" }, "Loading the model …");
-  const viewer = el("model-viewer", {
-    src: url, alt: "The textured model; drag or use the arrow keys to turn it", "camera-controls": "", "touch-action": "pan-y",
-    "interaction-prompt": "none", "shadow-intensity": "0", "tone-mapping": "neutral", poster: turntable[0] ?? thumbnail,
-  });
-  stage.append(viewer, wait);
-  if (orbit) { // where the turntable begins: by itself the viewer would look at a room's outer walls from far away
-    const back = Math.max(1, orbit.aspect / (stage.clientWidth / stage.clientHeight));
-    viewer.setAttribute("orientation", orbit.orientation.map((angle) => `${angle}rad`).join(" "));
-    viewer.setAttribute("camera-target", orbit.target.map((metres) => `${metres}m`).join(" "));
-    viewer.setAttribute("camera-orbit", `${orbit.theta}rad ${orbit.phi}rad ${orbit.radius * back}m`);
-    viewer.setAttribute("field-of-view", `${orbit.field_of_view}deg`);
-  }
-  const late = setTimeout(() => { wait.textContent = "Still loading; without a GPU this takes a while."; }, PATIENCE_MS);
-  viewer.addEventListener("load", () => { clearTimeout(late); wait.remove(); });
-  function fallBack() {
-    clearTimeout(late);
-    wait.textContent = "This browser cannot draw the model; these are pictures of it.";
-    if (turntable.length) viewer.replaceWith(...rotation(turntable));
-    wait.classList.add("top");
-  }
-  viewer.addEventListener("error", fallBack);
-  import("./vendor/model-viewer.min.js").catch(fallBack);
-}
-
-/** Pictures from all around, and a slider that turns them. */
-function rotation(frames) {
-  const picture = el("img", { class: "turntable", src: frames[0], alt: "The model from one side" });
-  const range = el("input", { class: "turn", type: "range", min: 0, max: frames.length - 1, value: 0, "aria-label": "Turn the model" });
-  range.addEventListener("input", () => {
-    picture.src = frames[Number(range.value)];
-    range.setAttribute("aria-valuetext", `${Math.round((360 * range.value) / frames.length)} degrees`);
-  });
-  return [picture, range];
 }
 
 function showDownloads(results) {

@@ -284,7 +284,7 @@ def test_what_is_said_of_a_mesh_that_is_made_ready_is_said_on_the_runs_thread() 
     scene, _ = made_scene(600, 1, 32, 24)
     with ChartMaker(None) as maker, MeshPreparation(300, maker) as preparation:
         preparation.begin(scene.mesh, moves=True)
-        mesh = preparation.result(Told())
+        mesh, _ = preparation.result(Told())
         assert maker._begun is None  # charts of a mesh that moves would be of no use
         preparation.begin(Mesh(mesh.v_pos, mesh.t_pos_idx))
         preparation.result(Told())

@@ -30,6 +30,7 @@ from advtex_engine.core.cameras import camera_center, project
 from advtex_engine.core.config import PRESETS, Preset
 from advtex_engine.core.monitor import Glimpse, Monitor
 from advtex_engine.core.scene import TO_Y_UP, Atlas, Camera, Mesh, Scene, View
+from advtex_engine.coverage import GUESSED, SEEN, UNSEEN
 from advtex_engine.ingest.shrink import shrink
 from advtex_engine.previews import live as live_module
 from advtex_engine.previews.curves import MAX_POINTS, curves
@@ -38,12 +39,20 @@ from advtex_engine.previews.turntable import camera_at, circle_cameras, facing, 
 from advtex_engine.render.pairs import related_pairs
 from advtex_engine.render.render_view import render_view
 from advtex_engine.render.view_maps import ViewMaps, build_view_maps
+from advtex_engine.results import seen as seen_module
 from advtex_engine.results.gallery import MAX_VIEWS, chosen_views, write_gallery
 from advtex_engine.results.initial_view import orbit
 from advtex_engine.results.result_page import embedded, write_page
+from advtex_engine.results.seen import write_seen
 
 HOSTILE = "</script><script>document.title='taken'</script>&lt;img src=x onerror=alert(1)>\u2028.png"
 SIDE = 64
+
+
+SHOWN = ("#frame", "#under", "#over", "#atlas img")
+STATE = torch.full((SIDE, SIDE), SEEN, dtype=torch.uint8)
+STATE[:, : SIDE // 2] = GUESSED
+STATE[: SIDE // 2] = UNSEEN
 
 
 def unwrapped(mesh: Mesh, texels: int = SIDE) -> Atlas:
@@ -92,7 +101,35 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Scene, Atlas
     out = tmp_path_factory.mktemp("result")
     made, atlas = scene()
     history = curves([{"step": 1, "l1": 0.5}, {"step": 2, "l1": math.nan}], [{"step": 2, "psnr": 30.0}])
-    return out, made, atlas, write_gallery(out, made, atlas, texture(), texture(1), history)
+    return out, made, atlas, write_gallery(out, made, atlas, texture(), texture(1), history, STATE)
+
+
+def test_what_is_not_seen_has_colors_of_its_own(result: tuple[Path, Scene, Atlas, tuple[Path, ...]]) -> None:
+    out, _, atlas, _ = result
+    page, seen = (read(out / f"previews/atlas_0{kind}.jpg").astype(int) for kind in ("", "_seen"))
+    half = SIDE // 2
+    clear = np.s_[half + 8 :, half + 8 :]  # JPEG's blocks keep to themselves
+    assert np.abs(seen - page)[clear].max() <= 2
+    purple, orange = seen[: half - 8].mean((0, 1)), seen[half + 8 :, : half - 8].mean((0, 1))
+    assert purple[1] < purple[[0, 2]].min() - 60
+    assert orange[2] < orange[1] - 60 < orange[0] - 60
+    (path,) = write_seen(out, atlas, STATE)
+    assert path == out / "model_seen.png"
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(image, STATE.numpy()), "gray, of three values, as the texture lies"
+
+
+def test_pages_have_an_image_each_of_what_is_seen_and_large_ones_are_thinned_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    atlas = replace(box(), pages=2)
+    assert atlas.mesh.v_uv is not None
+    atlas = replace(atlas, mesh=replace(atlas.mesh, v_uv=atlas.mesh.v_uv / 2 + torch.tensor([0.5, 0.5])))
+    monkeypatch.setattr(seen_module, "MAX_SIDE", 16)
+    (path,) = write_seen(tmp_path, atlas, STATE)
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    assert np.array_equal(image, STATE.numpy()[SIDE // 2 :: 2, SIDE // 2 :: 2])
 
 
 def read(path: Path) -> np.ndarray:
@@ -104,11 +141,14 @@ def read(path: Path) -> np.ndarray:
 def test_the_manifest_lists_every_picture(result: tuple[Path, Scene, Atlas, tuple[Path, ...]]) -> None:
     out, _, atlas, files = result
     manifest = json.loads((out / "previews/manifest.json").read_text())
-    assert set(manifest) == {"views", "turntable", "orbit", "thumbnail", "atlas", "curves"}
+    usual = {"views", "turntable", "orbit", "thumbnail", "atlas", "photographs", "curves"}
+    assert set(manifest) == usual | {"turntable_seen", "atlas_seen"}
     assert [view["name"] for view in manifest["views"] if view["heldout"]] == sorted([HOSTILE, "color/09b.png"])
     assert len(manifest["views"]) == MAX_VIEWS
-    named = [view[kind] for view in manifest["views"] for kind in ("photo", "render", "mean")]
+    named = [view[kind] for view in manifest["views"] for kind in ("photo", "render", "mean", "seen")]
+    named += [*manifest["turntable_seen"], *manifest["atlas_seen"]]
     named += [*manifest["turntable"], *manifest["atlas"], manifest["thumbnail"], manifest["curves"]]
+    named += [manifest["photographs"], json.loads((out / manifest["photographs"]).read_text())["stream"]]
     others = {"previews/manifest.json", "previews/comparison.png", "previews/sheet.png"}
     assert sorted([*named, *others]) == sorted(path.relative_to(out).as_posix() for path in files)
     assert manifest["turntable"] == [f"previews/turntable/{frame:02d}.jpg" for frame in range(24)]
@@ -165,6 +205,7 @@ def page_of(out: Path, name: str, files: tuple[Path, ...]) -> tuple[Page, str]:
         "warnings": [warning],
         "heldout": {"texture": {"psnr": math.nan}, "mean": {}},
         "conventions": {"summary": name},
+        "surface": {"seen": 0.5, "guessed": 0.125, "unseen": 0.375},
         "losses": [1],
     }
     text = write_page(out, report, files).read_text()
@@ -215,7 +256,18 @@ def test_the_page_opens_from_disk_and_runs_no_name(result: tuple[Path, Scene, At
         tab.mouse.down()
         tab.mouse.move(table["x"] + 100, table["y"] + 100)
         tab.mouse.up()
-        assert tab.locator("#frame").get_attribute("src") != first
+        turned = tab.locator("#frame").evaluate("image => image.src")
+        assert not turned.endswith(first or "none")
+        assert not tab.locator("#shares").is_visible()
+        tab.get_by_label("Show what no photograph shows").check()
+        assert (
+            tab.locator("#shares").inner_text().startswith("Photographs show 50.0 % of the surface. 12.5 % is guessed")
+        )
+        shown = {name: tab.locator(name).evaluate("image => image.src") for name in SHOWN}
+        assert shown["#frame"] == turned.replace(".jpg", "_seen.jpg")
+        assert shown["#under"].endswith("_seen.jpg")
+        assert shown["#atlas img"].endswith("atlas_0_seen.jpg")
+        assert shown["#over"].endswith("_photo.jpg")
         browser.close()
     assert problems == []
 

@@ -36,6 +36,9 @@ def write_zip(path: Path, **changed: bytes) -> Path:
 
 def test_what_is_kept_serves_other_files_of_the_same_texture(folder: Path) -> None:
     assert fingerprint(folder, replace(CONFIG, lossless=True)) == fingerprint(folder, CONFIG)
+    assert fingerprint(folder, replace(CONFIG, unseen="remove")) == fingerprint(folder, CONFIG)
+    for other in ({"box": "0,0,0,1,1,1"}, {"close_holes": 0.5}):
+        assert fingerprint(folder, replace(CONFIG, **other)) != fingerprint(folder, CONFIG)
     assert fingerprint(folder, replace(CONFIG, seed=1)) != fingerprint(folder, CONFIG)
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from advtex_engine.atlas.build import begin_charts
 from advtex_engine.atlas.chart_cache import ChartMaker
@@ -12,18 +13,35 @@ from advtex_engine.core.errors import Problem
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Mesh
 from advtex_engine.mesh.clean import clean, decimate
+from advtex_engine.mesh.holes import close_holes
+from advtex_engine.mesh.trim import crop, drop_floaters
+from advtex_options.box import Box
+
+
+@dataclass(frozen=True)
+class Trimmed:
+    """Faces that were left out of a mesh or added to it. made_up_faces: they close holes, and are its last ones."""
+
+    faces_outside_box: int = 0
+    floaters: int = 0
+    floater_faces: int = 0
+    closed_holes: int = 0
+    made_up_faces: int = 0
 
 
 class MeshPreparation:
-    """Cleans and decimates a mesh on a thread of its own; a context manager that leaves no thread behind.
+    """Cleans, trims and decimates a mesh on a thread of its own; a context manager that leaves no thread behind.
 
-    The charts are begun there as well where the mesh will stay as it is.
+    box: all outside is left out. holes: those with a border no longer than this are closed, metres. The charts are
+    begun there as well where the mesh will stay as it is.
     """
 
-    def __init__(self, face_budget: int, charts: ChartMaker) -> None:
-        self._face_budget, self._charts = face_budget, charts
+    def __init__(
+        self, face_budget: int, charts: ChartMaker, *, box: Box | None = None, holes: float | None = None
+    ) -> None:
+        self._face_budget, self._charts, self._box, self._holes = face_budget, charts, box, holes
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="advtex-mesh")
-        self._prepared: Future[tuple[Mesh, list[Problem]]] | None = None
+        self._prepared: Future[tuple[Mesh, Trimmed, list[Problem]]] | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -31,24 +49,58 @@ class MeshPreparation:
     def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
         self._pool.shutdown()
 
-    def begin(self, mesh: Mesh, *, moves: bool = False) -> None:
+    def begin(self, mesh: Mesh, *, up_axis: str = "+z", moves: bool = False) -> None:
         """Begins with a mesh. moves: it will be moved, so that charts of it would be of no use."""
-        self._prepared = self._pool.submit(self._prepare, mesh, moves)
+        self._prepared = self._pool.submit(self._prepare, mesh, up_axis, moves)
 
-    def result(self, monitor: Monitor) -> Mesh:
-        """The mesh that was begun with, once it is ready; raises what `clean` does, and tells the monitor the rest."""
+    def result(self, monitor: Monitor) -> tuple[Mesh, dict[str, Any]]:
+        """The mesh that was begun with, once it is ready, and what was trimmed of it, for the report.
+
+        Raises what `clean` and `crop` do, and tells the monitor the rest.
+        """
         assert self._prepared is not None
-        mesh, problems = self._prepared.result()
+        mesh, trimmed, problems = self._prepared.result()
         for problem in problems:
             monitor.warning(problem)
-        return mesh
+        return mesh, asdict(trimmed)
 
-    def _prepare(self, mesh: Mesh, moves: bool) -> tuple[Mesh, list[Problem]]:
+    def _prepare(self, mesh: Mesh, up_axis: str, moves: bool) -> tuple[Mesh, Trimmed, list[Problem]]:
         said = _Said()
-        prepared = decimate(clean(mesh), self._face_budget, said)
+        cleaned = clean(mesh)
+        cropped = cleaned if self._box is None else crop(cleaned, self._box, up_axis)
+        kept, floaters = drop_floaters(cropped)
+        lost = len(cropped.t_pos_idx) - len(kept.t_pos_idx)
+        if floaters:
+            said.warning(_floaters_dropped(floaters, lost))
+        prepared = decimate(kept, self._face_budget, said)
+        closed, holes = (prepared, 0) if self._holes is None else close_holes(prepared, self._holes)
+        if holes and prepared.v_uv is not None:
+            said.warning(_uv_dropped(holes))
         if not moves:
-            begin_charts(prepared, self._charts)
-        return prepared, said.problems
+            begin_charts(closed, self._charts)
+        outside, added = (
+            len(cleaned.t_pos_idx) - len(cropped.t_pos_idx),
+            len(closed.t_pos_idx) - len(prepared.t_pos_idx),
+        )
+        return closed, Trimmed(outside, floaters, lost, holes, added), said.problems
+
+
+def _floaters_dropped(floaters: int, faces: int) -> Problem:
+    return Problem(
+        "floaters_dropped",
+        "mesh",
+        f"{floaters:,} small loose pieces of together {faces:,} faces are left out",
+        "none needed; what is missing of the model has to be connected to the rest of the mesh",
+    )
+
+
+def _uv_dropped(holes: int) -> Problem:
+    return Problem(
+        "uv_dropped",
+        "mesh",
+        f"the mesh's texture coordinates are not kept: {holes:,} holes were closed by faces that have none",
+        "leave the holes open, or accept the new atlas",
+    )
 
 
 class _Said(Monitor):

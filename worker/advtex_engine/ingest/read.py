@@ -51,11 +51,12 @@ from advtex_scan.manifest import (
     Matrix4,
     MeshRefinement,
     ScanManifest,
+    UpAxis,
     VideoFrame,
 )
 
-OnMesh = Callable[[Mesh, MeshRefinement], None]
-"""Mesh in world coordinates, and how it may still be moved."""
+OnMesh = Callable[[Mesh, MeshRefinement, UpAxis], None]
+"""Mesh in world coordinates, how it may still be moved, and the world's up axis."""
 
 MAX_IMAGE_BYTES = 256 << 20
 # Frames whose depth is compared with the mesh to find out how it is encoded.
@@ -135,7 +136,7 @@ def _capture(
     if entry is not None and mesh is not None:
         mesh = _placed(mesh, entry.mesh_to_world)
         if on_mesh is not None:
-            on_mesh(mesh, entry.refinement)
+            on_mesh(mesh, entry.refinement, manifest.up_axis)
     # A mesh that is placed roughly, to be moved onto the depth, says nothing about the depth.
     placed = None if entry is None or entry.refinement != "none" else mesh
     encoding = _depth_encoding(archive, manifest, placed, config.refines, monitor)

@@ -52,8 +52,8 @@ def close_pinholes(mesh: Mesh) -> Mesh:
     mesh: clean. The border of a small separate piece is no hole: its fan would face the other way than its faces.
     """
     position, faces = mesh.v_pos.numpy(), mesh.t_pos_idx.numpy()
-    edges, normals = _border(position, faces)
-    after = _only_successor(edges, len(position))
+    edges, normals = border(position, faces)
+    after = only_successor(edges, len(position))
     added: list[Integers] = []
     centers: list[Floats] = []
     for loop in _short_loops(edges, after):
@@ -77,7 +77,7 @@ def close_pinholes(mesh: Mesh) -> Mesh:
 def grow_borders(mesh: Mesh, width: float) -> Mesh:
     """The border's vertices moved outward in their faces' plane by up to `width` metres; less at sharp corners."""
     position = mesh.v_pos.numpy().astype(np.float64)
-    edges, normals = _border(mesh.v_pos.numpy(), mesh.t_pos_idx.numpy())
+    edges, normals = border(mesh.v_pos.numpy(), mesh.t_pos_idx.numpy())
     along = position[edges[:, 1]] - position[edges[:, 0]]
     outward, length, share = np.cross(along, _unit(normals)), np.linalg.norm(along, axis=1), np.zeros(len(position))
     offset = np.zeros_like(position)
@@ -90,8 +90,8 @@ def grow_borders(mesh: Mesh, width: float) -> Mesh:
 
 def _notches(position: Floats, faces: Integers, widest: float) -> Integers:
     """Triangles [N,3] over pairs of successive border edges a-b-c, each edge in one at most; a-c is the new border."""
-    edges, normals = _border(position, faces)
-    after = _only_successor(edges, len(position))
+    edges, normals = border(position, faces)
+    after = only_successor(edges, len(position))
     first = np.flatnonzero(after >= 0)
     second = after[first]
     a, b, c = edges[first, 0], edges[first, 1], edges[second, 1]
@@ -113,7 +113,7 @@ def _unit(vectors: Floats) -> Floats:
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30))
 
 
-def _border(position: npt.NDArray[np.floating], faces: Integers) -> tuple[Integers, Floats]:
+def border(position: npt.NDArray[np.floating], faces: Integers) -> tuple[Integers, Floats]:
     """Directed edges [B,2] that only one face has, and that face's normal (of twice its area's length) [B,3]."""
     corners = position.astype(np.float64)[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -124,7 +124,7 @@ def _border(position: npt.NDArray[np.floating], faces: Integers) -> tuple[Intege
     return edges[single], normals[single // 3]
 
 
-def _only_successor(edges: Integers, vertices: int) -> Integers:
+def only_successor(edges: Integers, vertices: int) -> Integers:
     """The border edge that begins where each border edge ends [B]; -1 where there are none or several."""
     starts = np.bincount(edges[:, 0], minlength=vertices)
     at = np.full(vertices, -1)

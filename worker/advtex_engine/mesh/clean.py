@@ -33,7 +33,7 @@ def clean(mesh: Mesh) -> Mesh:
     """
     position, inverse = _unique_rows(mesh.v_pos.numpy())
     faces = inverse[mesh.t_pos_idx.numpy()]
-    keep = np.flatnonzero(_has_area(position, faces))
+    keep = np.flatnonzero(has_area(position, faces))
     keep = keep[_first_of_each(np.sort(faces[keep], axis=1))]
     if len(keep) == 0:
         raise ScanError(
@@ -95,7 +95,7 @@ def decimate(mesh: Mesh, face_budget: int, monitor: Monitor) -> Mesh:
     return decimated
 
 
-def _has_area(position: npt.NDArray[np.float32], faces: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+def has_area(position: npt.NDArray[np.float32], faces: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
     corners = position.astype(np.float64)[faces]
     finite = np.asarray(np.isfinite(corners).all(axis=(1, 2)))
     a, b, c = np.moveaxis(np.where(finite[:, None, None], corners, 0.0), 1, 0)

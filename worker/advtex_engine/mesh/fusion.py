@@ -19,6 +19,7 @@ from advtex_engine.core.errors import Problem, ScanError
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import DepthFrame, Mesh
 from advtex_engine.mesh.marching_cubes import extract_surface
+from advtex_engine.mesh.pieces import pieces
 from advtex_engine.mesh.tsdf import VOXELS, Sampling, find_blocks, integrate
 
 # Metres. A room is seen from 1.5 m and more, where sensors and poses are no better than the coarsest. What is scanned
@@ -95,7 +96,7 @@ def choose_voxel_size(reference: float) -> float:
 
 def remove_floaters(mesh: Mesh) -> tuple[Mesh, int]:
     """The mesh without pieces of fewer than FLOATER_SHARE of its faces and without loose vertices; how many went."""
-    label = _pieces(mesh)
+    label = pieces(mesh)
     of_face = label[mesh.t_pos_idx[:, 0]]
     faces = torch.bincount(of_face, minlength=len(mesh.v_pos))
     floats = (faces > 0) & (faces < FLOATER_SHARE * len(of_face))
@@ -103,21 +104,6 @@ def remove_floaters(mesh: Mesh) -> tuple[Mesh, int]:
     used = torch.zeros(len(mesh.v_pos), dtype=torch.bool, device=label.device)
     used[kept.view(-1)] = True
     return Mesh(mesh.v_pos[used], (used.cumsum(0) - 1)[kept]), int(floats.sum())
-
-
-def _pieces(mesh: Mesh) -> Tensor:
-    """[V] the least index of a vertex that each vertex is connected to by faces."""
-    label = torch.arange(len(mesh.v_pos), device=mesh.v_pos.device)
-    while True:
-        least = label[mesh.t_pos_idx].amin(1)
-        lower = label.clone()
-        for corner in mesh.t_pos_idx.T:
-            lower.scatter_reduce_(0, corner, least, "amin")
-            lower.scatter_reduce_(0, label[corner], least, "amin")
-        lower = lower[lower]
-        if torch.equal(lower, label):
-            return label
-        label = lower
 
 
 def _voxels(

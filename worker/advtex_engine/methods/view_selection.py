@@ -33,7 +33,9 @@ class Selection:
 
 def view_selection(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     """The texture of `select_views`; no iterations, so no losses."""
-    return select_views(given).texture, []
+    selection = select_views(given)
+    given.facts["known"] = selection.known
+    return selection.texture, []
 
 
 def select_views(given: MethodInput) -> Selection:

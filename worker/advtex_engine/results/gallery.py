@@ -2,11 +2,15 @@
 
 comparison.png, sheet.png    photograph | textured render | projected mean of one view, and of a few
 views/NNNN_photo.jpg, NNNN_render.jpg, NNNN_mean.jpg      the same of up to MAX_VIEWS views, at the same size
+views/NNNN_seen.jpg          the render, with what no photograph shows in colors of its own (`seen.py`)
 turntable/NN.jpg             the model from all around
-atlas_N.jpg                  the texture's pages
+turntable/NN_seen.jpg        the same in those colors
+atlas_N.jpg, atlas_N_seen.jpg
+                             the texture's pages
 thumbnail.jpg                a good view of the model, square
+photographs.json, .mjpeg     photographs with their cameras, see `photographs.py`
 curves.json                  see `curves.py`
-manifest.json                lists all but the first two; its paths are relative to the result's folder
+manifest.json                lists all but the first two and the stream; its paths are relative to the result's folder
 """
 
 from __future__ import annotations
@@ -27,6 +31,8 @@ from advtex_engine.previews.turntable import SIZE, Circle, circle_cameras, facin
 from advtex_engine.render.pictures import contact_sheet, encode_jpeg, side_by_side, to_bytes
 from advtex_engine.render.render_view import GBuffer, gbuffer, gbuffers, shade
 from advtex_engine.results.initial_view import orbit
+from advtex_engine.results.photographs import photograph_stream
+from advtex_engine.results.seen import marks, tinted
 from advtex_engine.runtime.files import write_atomically
 from advtex_engine.runtime.threads import in_threads, one_thread_each
 
@@ -43,15 +49,23 @@ Image = NDArray[np.uint8]
 
 
 def write_gallery(
-    out: Path, scene: Scene, atlas: Atlas, texture: Tensor, mean: Tensor, curves: Mapping[str, Any]
+    out: Path,
+    scene: Scene,
+    atlas: Atlas,
+    texture: Tensor,
+    mean: Tensor,
+    curves: Mapping[str, Any],
+    state: Tensor | None = None,
 ) -> tuple[Path, ...]:
     """Writes all pictures below `out`/previews; -> their paths, the manifest last.
 
     texture, mean: [atlas.height,atlas.width,3] float sRGB in [0,1] on the device of the atlas's mesh, which renders.
-    curves: see `curves.py`. Pictures are encoded and written in a few threads while the next ones are rendered.
+    curves: see `curves.py`. state: [H,W] uint8 of `coverage`, for the pictures `_seen`; None: there are none of these.
+    Pictures are encoded and written in a few threads while the next ones are rendered.
     """
     with one_thread_each():
-        return _write_pictures(_Gallery(out), scene, atlas, texture, mean, curves)
+        marked = None if state is None else marks(state)
+        return _write_pictures(_Gallery(out, marked), scene, atlas, texture, mean, curves)
 
 
 def _write_pictures(
@@ -66,19 +80,26 @@ def _write_pictures(
     supersample = 2 if scene.views[0].camera.width >= SIZE[0] else 1
     buffers = enumerate(turntable(atlas, circle, supersample))
     gallery.turntable = gallery.save_all(
-        (f"turntable/{frame:02d}.jpg", _shaded(buffer, coarse)) for frame, buffer in buffers
+        picture
+        for frame, buffer in buffers
+        for picture in gallery.both(f"turntable/{frame:02d}", buffer, shade(buffer, coarse))
     )
-    pages = enumerate(_pages(texture, atlas.pages))
-    atlases = gallery.save_all((f"atlas_{number}.jpg", page) for number, page in pages)
+    atlases = gallery.save_all(_atlas_pictures(gallery, texture, atlas.pages))
     (thumbnail,) = gallery.save_all([("thumbnail.jpg", _thumbnail(atlas, circle, coarse, renders))])
-    manifest = {
+    entries, stream = photograph_stream(scene, atlas, texture)
+    photographs = {"stream": gallery.write("photographs.mjpeg", stream), "views": entries}
+    step = 1 if gallery.marked is None else 2
+    manifest: dict[str, Any] = {
         "views": gallery.views,
-        "turntable": gallery.turntable,
+        "turntable": gallery.turntable[::step],
         "orbit": orbit(circle, scene.up_axis),
         "thumbnail": thumbnail,
-        "atlas": atlases,
+        "atlas": atlases[::step],
+        "photographs": gallery.write("photographs.json", _json(photographs)),
         "curves": gallery.write("curves.json", _json(curves)),
     }
+    if gallery.marked is not None:
+        manifest |= {"turntable_seen": gallery.turntable[1::step], "atlas_seen": atlases[1::step]}
     gallery.write("manifest.json", _json(manifest))
     return tuple(gallery.files)
 
@@ -92,14 +113,23 @@ def chosen_views(scene: Scene) -> list[tuple[View, bool]]:
 
 
 class _Gallery:
-    """The files written so far, and the manifest's lists."""
+    """The files written so far, and the manifest's lists.
 
-    def __init__(self, out: Path) -> None:
-        self.out = out
+    marked: a texture of `marks`, for a second picture of each that shows the model; None: there are none.
+    """
+
+    def __init__(self, out: Path, marked: Tensor | None = None) -> None:
+        self.out, self.marked = out, marked
         self.folder = out / "previews"
         self.files: list[Path] = []
         self.views: list[dict[str, Any]] = []
         self.turntable: list[str] = []
+
+    def both(self, name: str, buffer: GBuffer, picture: Tensor) -> Iterator[tuple[str, Image]]:
+        """A picture of the model, and the same with what no photograph shows."""
+        yield f"{name}.jpg", to_bytes(picture)
+        if self.marked is not None:
+            yield f"{name}_seen.jpg", to_bytes(tinted(picture, shade(buffer, self.marked, background=0.0)))
 
     def save_all(self, pictures: Iterable[tuple[str, Image]]) -> list[str]:
         """Writes JPEGs. -> their paths as the manifest has them."""
@@ -155,6 +185,11 @@ def _view_pictures(
             yield name, image
         gallery.views.append(entry)
         renders.append((buffer.coverage, images[1]))
+        if gallery.marked is not None:
+            name = f"views/{number:04d}_seen.jpg"
+            entry["seen"] = gallery.listed(name)
+            seen = tinted(pictures[0], shade(buffer, gallery.marked, background=0.0))
+            yield name, _reduced(to_bytes(seen), LONGEST_SIDE)
     middle = len(shown) // 2
     rendered, averaged = rows[middle]
     gallery.folder.mkdir(parents=True, exist_ok=True)
@@ -184,17 +219,30 @@ def _coarse(texture: Tensor) -> Tensor:
     return torch.from_numpy(_reduced(texture.cpu().numpy(), TURNTABLE_TEXTURE)).to(texture.device)
 
 
-def _shaded(buffer: GBuffer, texture: Tensor) -> Image:
-    return to_bytes(shade(buffer, texture))
+def _atlas_pictures(gallery: _Gallery, texture: Tensor, count: int) -> Iterator[tuple[str, Image]]:
+    marked = None if gallery.marked is None else _page_tensors(gallery.marked, count)
+    for number, page in enumerate(_pages(texture, count)):
+        yield f"atlas_{number}.jpg", page
+        if marked is not None:
+            size = (page.shape[1], page.shape[0])
+            area = cv2.resize(next(marked).cpu().numpy(), size, interpolation=cv2.INTER_AREA)
+            yield (
+                f"atlas_{number}_seen.jpg",
+                to_bytes(tinted(torch.from_numpy(page).float() / 255, torch.from_numpy(area))),
+            )
 
 
 def _pages(texture: Tensor, count: int) -> Iterator[Image]:
+    for page in _page_tensors(texture, count):
+        # Made smaller first: a page's bytes and their temporaries would take as much memory as the texture.
+        yield to_bytes(torch.from_numpy(_reduced(page.cpu().numpy(), ATLAS_SIDE)))
+
+
+def _page_tensors(texture: Tensor, count: int) -> Iterator[Tensor]:
     height, width = texture.shape[0] // count, texture.shape[1] // count
     for row in range(count):
         for column in range(count):
-            page = texture[row * height : (row + 1) * height, column * width : (column + 1) * width]
-            # Made smaller first: a page's bytes and their temporaries would take as much memory as the texture.
-            yield to_bytes(torch.from_numpy(_reduced(page.cpu().numpy(), ATLAS_SIDE)))
+            yield texture[row * height : (row + 1) * height, column * width : (column + 1) * width]
 
 
 def _reduced(pixels: NDArray[Any], longest: int) -> NDArray[Any]:

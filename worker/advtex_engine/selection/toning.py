@@ -29,11 +29,20 @@ def tone_views(maps: ViewMaps, texture: Tensor) -> None:
         view = maps.only(index)
         color = view.color[0].to(torch.float32)
         shown = 255 * sample_image(texture, decode_uv(view.uv[0]) * size)
-        seen = (view.depth[0] > 0)[:, None]
-        difference = torch.where(seen, (shown - color).clamp(-LARGEST, LARGEST), 0.0)
-        with_weight = torch.cat((difference, seen.to(difference.dtype)), 1)
-        tone = _spread(with_weight.T.view(1, 4, maps.height, maps.width))[0].flatten(1).T
+        seen = view.depth[0] > 0
+        difference = (shown - color).view(maps.height, maps.width, 3)
+        tone = tone_difference(difference, seen.view(maps.height, maps.width)).view(-1, 3)
         maps.color[index] = (color + tone).round().clamp(0, 255).to(torch.uint8)
+
+
+def tone_difference(difference: Tensor, seen: Tensor) -> Tensor:
+    """What a view [H,W,3] is to be shifted by, in gray levels: wide averages of what the texture shows less the view.
+
+    seen: [H,W] bool, where the texture shows something. The shift is 0 where it shows nothing nearby.
+    """
+    known = torch.where(seen[..., None], difference.clamp(-LARGEST, LARGEST), 0.0)
+    with_weight = torch.cat((known, seen[..., None].to(known.dtype)), 2)
+    return _spread(with_weight.permute(2, 0, 1)[None])[0].permute(1, 2, 0)
 
 
 def _spread(difference: Tensor) -> Tensor:

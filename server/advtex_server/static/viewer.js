@@ -1,0 +1,102 @@
+// The model in 3D: model-viewer with what one can do there, or pictures where it cannot draw.
+
+import { backgroundChoice, lightChoice, seenChoice, setLight } from "./appearance.js";
+import { el } from "./base.js";
+import { orientationRows } from "./cameras.js";
+import { measuring } from "./measure.js";
+import { Photographs, lumigraphButton, photographChoice } from "./photographs.js";
+
+const PATIENCE_MS = 15000;
+const TOUCHED = matchMedia("(pointer: coarse)"); // phones and tablets: they get the small model, where there is one
+
+/** manifest: of the previews, or null. address: the URL of a result file, null if there is none. */
+export function showModel(section, manifest, address) {
+  const stage = el("div", { class: "stage" });
+  section.append(stage);
+  const url = (TOUCHED.matches && address("model_mobile.glb")) || address("model.glb");
+  if (!url) {
+    stage.append(el("p", { class: "wait" }, "There is no model.glb in this result."));
+    return;
+  }
+  const turntable = (manifest?.turntable ?? []).map(address).filter(Boolean);
+  const wait = el("p", { class: "wait", role: "status" }, "Loading the model …");
+  const viewer = el("model-viewer", {
+    src: url, alt: "The textured model; drag or use the arrow keys to turn it", "camera-controls": "", "touch-action": "pan-y",
+    "interaction-prompt": "none", "shadow-intensity": "0", poster: turntable[0] ?? address(manifest?.thumbnail),
+    ar: "", "ar-modes": "webxr quick-look", "ar-scale": "fixed", "min-camera-orbit": "auto 0rad 1cm", "max-camera-orbit": "auto 180deg auto", "max-field-of-view": "120deg",
+  });
+  stage.append(viewer, wait);
+  if (manifest?.orbit) start(viewer, stage, manifest.orbit);
+  const late = setTimeout(() => { wait.textContent = "Still loading; without a GPU this takes a while."; }, PATIENCE_MS);
+  viewer.addEventListener("load", () => {
+    clearTimeout(late);
+    wait.remove();
+    setLight(viewer, "photographed");
+    section.append(tools(viewer, stage, url, manifest, address));
+  }, { once: true });
+  function fallBack() {
+    clearTimeout(late);
+    wait.textContent = "This browser cannot draw the model; these are pictures of it.";
+    if (turntable.length) viewer.replaceWith(...rotation(turntable));
+    wait.classList.add("top");
+  }
+  viewer.addEventListener("error", fallBack);
+  import("./vendor/model-viewer.min.js").catch(fallBack);
+}
+
+/** Where the turntable begins: by itself the viewer would look at a room's outer walls from far away. */
+function start(viewer, stage, orbit) {
+  const back = Math.max(1, orbit.aspect / (stage.clientWidth / stage.clientHeight));
+  viewer.setAttribute("orientation", orbit.orientation.map((angle) => `${angle}rad`).join(" "));
+  viewer.setAttribute("camera-target", orbit.target.map((metres) => `${metres}m`).join(" "));
+  viewer.setAttribute("camera-orbit", `${orbit.theta}rad ${orbit.phi}rad ${orbit.radius * back}m`);
+  viewer.setAttribute("field-of-view", `${orbit.field_of_view}deg`);
+}
+
+function tools(viewer, stage, url, manifest, address) {
+  const said = el("p", { class: "hint", role: "status" });
+  const bar = el("div", { class: "toolbar tools" }, lightChoice(viewer), backgroundChoice(stage), seenChoice(viewer, seenPages(address)),
+    measuring(viewer, stage, said), arButton(viewer, address("model.usdz"), said));
+  if (manifest?.photographs && manifest.orbit) addPhotographs(bar, viewer, stage, url, manifest, address, said);
+  return el("div", {}, bar, said);
+}
+
+function seenPages(address) {
+  const names = ["model_seen.png", ...[2, 3, 4].map((page) => `model_seen_${page}.png`)];
+  return names.map(address).filter(Boolean);
+}
+
+async function addPhotographs(bar, viewer, stage, url, { photographs, orbit }, address, said) {
+  const listed = await fetch(address(photographs)).then((answer) => (answer.ok ? answer.json() : null)).catch(() => null);
+  if (!listed) return;
+  const found = new Photographs(listed, address);
+  const stand = orientationRows(orbit.orientation);
+  bar.append(photographChoice(viewer, stage, found, orbit, stand), lumigraphButton(viewer, stage, found, url, stand, said));
+}
+
+/** Only where it can be: WebXR takes the model that is loaded; Quick Look, which knows nothing of the session, a copy of the USDZ. */
+function arButton(viewer, usdz, said) {
+  return el("button", { type: "button", hidden: !viewer.canActivateAR, onclick: async () => {
+    try {
+      if (usdz && !viewer.iosSrc && document.createElement("a").relList.supports("ar")) {
+        said.textContent = "Loading the model for AR …";
+        viewer.iosSrc = URL.createObjectURL(await (await fetch(usdz)).blob());
+      }
+      await viewer.activateAR();
+      said.textContent = "";
+    } catch (error) {
+      said.textContent = `AR cannot be started: ${error.message}`;
+    }
+  } }, "View in AR");
+}
+
+/** Pictures from all around, and a slider that turns them. */
+function rotation(frames) {
+  const picture = el("img", { class: "turntable", src: frames[0], alt: "The model from one side" });
+  const range = el("input", { class: "turn", type: "range", min: 0, max: frames.length - 1, value: 0, "aria-label": "Turn the model" });
+  range.addEventListener("input", () => {
+    picture.src = frames[Number(range.value)];
+    range.setAttribute("aria-valuetext", `${Math.round((360 * range.value) / frames.length)} degrees`);
+  });
+  return [picture, range];
+}

@@ -1,0 +1,91 @@
+"""Photographs where the viewer stands: Chromium draws what torch draws, and the page's cameras are the engine's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from atlases import camera
+from browsing import FLAGS, chromium
+from lumigraph import blended, photographed_scene, photographs
+from playwright.sync_api import Page, sync_playwright
+
+from advtex_engine.core.cameras import camera_to_world
+from advtex_engine.core.scene import Camera
+from advtex_engine.results import export_model
+from advtex_engine.results.photographs import photograph_stream
+from advtex_server.static_files import FOLDER
+
+pytestmark = pytest.mark.slow
+DRAW = """async ({ views, place }) => {
+    const { Lumigraph } = await import("/lumigraph.js");
+    const { photographCamera } = await import("/cameras.js");
+    const { triangles } = await import("/glb.js");
+    const [model, stream] = await Promise.all(["/model.glb", "/stream"].map((name) => fetch(name)));
+    const jpegs = await stream.blob();
+    const found = await Promise.all(views.map(async (view) => ({
+        camera: photographCamera(view),
+        picture: await createImageBitmap(jpegs.slice(view.offset, view.offset + view.bytes, "image/jpeg")),
+    })));
+    const canvas = document.createElement("canvas");
+    [canvas.width, canvas.height] = [place.width, place.height];
+    new Lumigraph(canvas, triangles(await model.arrayBuffer()), found).draw(photographCamera(place));
+    const pixels = new Uint8Array(4 * place.width * place.height);
+    const gl = canvas.getContext("webgl2");
+    gl.readPixels(0, 0, place.width, place.height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+    return { pixels: Array.from(pixels), error: gl.getError() };
+}"""
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> Iterator[Page]:
+    """A page with the server's scripts and the files of `tmp_path`, without a server."""
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium(), args=FLAGS)
+        tab = browser.new_page()
+        tab.route("http://page/", lambda route: route.fulfill(body="", content_type="text/html"))
+        tab.route("http://page/*.js", lambda route: route.fulfill(path=FOLDER / route.request.url.rpartition("/")[2]))
+        tab.route("http://page/model.glb", lambda route: route.fulfill(path=tmp_path / "model.glb"))
+        tab.route("http://page/stream", lambda route: route.fulfill(path=tmp_path / "stream"))
+        tab.goto("http://page/")
+        yield tab
+        browser.close()
+
+
+@pytest.mark.parametrize("eye", [(2.6, 1.0, 1.8), (1.9, -2.2, 0.9)], ids=["on the path", "beside it"])
+def test_the_browser_blends_photographs_as_torch_does(
+    page: Page, tmp_path: Path, eye: tuple[float, float, float]
+) -> None:
+    scene, atlas, texture = photographed_scene()
+    export_model(tmp_path, atlas, texture, up_axis=scene.up_axis)
+    entries, stream = photograph_stream(scene, atlas, texture)
+    (tmp_path / "stream").write_bytes(stream)
+    colors = [decoded(stream[entry["offset"] :][: entry["bytes"]]) for entry in entries]
+    given = photographs(scene.mesh, [view.camera for view in scene.views], colors)
+    place = camera(eye, 200, 150, 180.0)
+    color, share = blended(scene.mesh, given, place)
+    drawn = page.evaluate(DRAW, {"views": entries, "place": in_glb(place)})
+    assert drawn["error"] == 0
+    found = np.array(drawn["pixels"], np.float64).reshape(150, 200, 4)[::-1] / 255
+    wanted = torch.cat((color * share[..., None], share[..., None]), 2).numpy()
+    assert 0.2 < wanted[..., 3].mean() < 0.9
+    difference = np.abs(found - wanted).max(2)
+    assert np.median(difference) < 0.01
+    assert (difference > 0.06).mean() < 0.03, "other pixels are at edges, where rasterizers differ"
+
+
+def decoded(jpeg: bytes) -> torch.Tensor:
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    return torch.from_numpy(image[..., ::-1].copy())
+
+
+def in_glb(place: Camera) -> dict[str, object]:
+    """As `previews/photographs.json` has cameras, of a scan whose z is up."""
+    to_glb = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    pose = (to_glb @ camera_to_world(place).numpy()).tolist()
+    return {"K": place.K.tolist(), "camera_to_world": pose, "width": place.width, "height": place.height}

@@ -20,6 +20,7 @@ from advtex_server.deliveries import rules
 from advtex_server.events import Lookout
 from advtex_server.intake import Intake
 from advtex_server.metrics import Metrics, MetricsMiddleware
+from advtex_server.metrics_access import MetricsAccess
 from advtex_server.older_clients import OlderClientsMiddleware
 from advtex_server.refusal import ANYWHERE
 from advtex_server.routes import batches, health, jobs, pages, uploads, webhooks
@@ -29,6 +30,7 @@ from advtex_server.tus import TusMiddleware
 from advtex_server.webhooks import WebhookService
 from advtex_store.database import upgrade_database
 from advtex_store.store import open_store
+from advtex_store.tracing import open_traces
 
 
 def create_app(settings: ServerSettings, *, dispatch: bool = True) -> FastAPI:
@@ -38,14 +40,16 @@ def create_app(settings: ServerSettings, *, dispatch: bool = True) -> FastAPI:
     `app.state.stopping` is set by whoever stops the server, so that open event streams end at once.
     """
     store = open_store(settings)
-    background = Background(store, settings) if dispatch else None
-    metrics = Metrics(store)
+    traces = open_traces("advtex-server")
+    metrics = Metrics(store, settings.metrics_owners if settings.metrics_guarded else 0)
+    background = Background(store, settings, metrics, traces) if dispatch else None
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         await asyncio.to_thread(upgrade_database, settings.database)
         known_methods()  # the log says at once which ones of other packages cannot be used
         async with AsyncExitStack() as stack:
+            stack.push_async_callback(asyncio.to_thread, traces.close)
             if background is not None:
                 await stack.enter_async_context(background.running())
             yield
@@ -65,16 +69,16 @@ def create_app(settings: ServerSettings, *, dispatch: bool = True) -> FastAPI:
         docs_url=None,  # their pages load scripts from elsewhere
         redoc_url=None,
     )
-    app.state.service = Service(store, settings, wake)
+    app.state.service = Service(store, settings, wake, traces)
     app.state.webhooks = WebhookService(store.webhooks, rules(settings))
-    app.state.metrics = metrics
     app.state.stopping = asyncio.Event()
-    app.state.intake = Intake(store, settings)
+    app.state.intake = Intake(store, settings, traces)
     app.state.bodies = OpenBodies()
     app.state.lookout = Lookout(app.state.service)
     errors.install(app)
     authenticator = Authenticator(store.accounts, settings.auth_failures_per_minute)
     browser_sessions = BrowserSessions(store.sessions)
+    app.state.metrics_access = MetricsAccess(metrics, authenticator, settings)
     app.state.authenticator, app.state.browser_sessions = authenticator, browser_sessions
     app.add_middleware(
         AccessMiddleware,

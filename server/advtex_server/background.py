@@ -12,17 +12,19 @@ from contextlib import asynccontextmanager, suppress
 from advtex_server.checking import Checker
 from advtex_server.deliveries import Deliverer
 from advtex_server.dispatch import Dispatcher
+from advtex_server.metrics import Metrics
 from advtex_server.settings import ServerSettings
 from advtex_store.store import Store
+from advtex_store.tracing import OFF, Traces
 
 
 class Background:
     """All of it, on one store."""
 
-    def __init__(self, store: Store, settings: ServerSettings) -> None:
-        self._dispatcher = Dispatcher(store, settings)
-        self._checker = Checker(store, settings, self._dispatcher.wake)
-        self._deliverer = Deliverer(store.webhooks, settings)
+    def __init__(self, store: Store, settings: ServerSettings, metrics: Metrics, traces: Traces = OFF) -> None:
+        self._dispatcher = Dispatcher(store, settings, metrics.round, traces)
+        self._checker = Checker(store, settings, self._dispatcher.wake, traces)
+        self._deliverer = Deliverer(store.webhooks, settings, metrics.delivered, traces)
 
     def wake(self) -> None:
         """From any thread: look now."""

@@ -39,6 +39,7 @@ from advtex_store.process_ends import how_it_ended
 from advtex_store.references import RemoteScan
 from advtex_store.secrecy import public_environment
 from advtex_store.store import Store
+from advtex_store.tracing import OFF, Traces
 
 COMMAND = (sys.executable, "-m", "advtex_server.check_process")
 PROCESSES = 2
@@ -62,8 +63,9 @@ class Stopping(Exception):
 class Checker:
     """Checks what is to be checked. `wake` is called when a job has been queued."""
 
-    def __init__(self, store: Store, settings: ServerSettings, wake: Callable[[], None]) -> None:
+    def __init__(self, store: Store, settings: ServerSettings, wake: Callable[[], None], traces: Traces = OFF) -> None:
         self._store = store
+        self._traces = traces
         self._poll_seconds = settings.dispatch_seconds
         self._wake = wake
         self._news = threading.Event()
@@ -107,6 +109,7 @@ class Checker:
 
     def _carry(self, claim: CheckClaim) -> None:
         """One check, and its outcome, which does not count once the claim is lost."""
+        span = self._traces.span("check", claim.traceparent, job=claim.job_id)
         try:
             outcome = self._outcome(claim)
             give_up = time.monotonic() + self._store.checks.lease_seconds
@@ -121,6 +124,8 @@ class Checker:
         except StaleAttempt as error:
             log.info("a check is stale", job=claim.job_id, reason=str(error))
             return
+        finally:
+            span.end()
         self._wake()
 
     def _outcome(self, claim: CheckClaim) -> Callable[[], object]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import ssl
+from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import partial
 
@@ -16,6 +17,7 @@ from starlette.concurrency import run_in_threadpool
 
 from advtex_server.settings import ServerSettings
 from advtex_server.targets import TargetRefused, TargetRules
+from advtex_store.tracing import OFF, Traces
 from advtex_store.webhooks import Delivery, Webhooks
 
 LOOK_SECONDS = 1.0
@@ -26,10 +28,18 @@ log = structlog.get_logger("advtex.webhooks")
 
 
 class Deliverer:
-    """One task; any number of servers may run one."""
+    """One task; any number of servers may run one. count: told of each try whether it was `delivered` or `failed`."""
 
-    def __init__(self, webhooks: Webhooks, settings: ServerSettings) -> None:
+    def __init__(
+        self,
+        webhooks: Webhooks,
+        settings: ServerSettings,
+        count: Callable[[str], None] = lambda _outcome: None,
+        traces: Traces = OFF,
+    ) -> None:
         self.webhooks = webhooks
+        self._count = count
+        self._traces = traces
         self.rules = rules(settings)
         self._running: dict[str, asyncio.Task[None]] = {}
 
@@ -66,7 +76,11 @@ class Deliverer:
     async def _attempt(self, client: httpx.AsyncClient, delivery: Delivery) -> None:
         bound = log.bind(webhook=delivery.webhook_id, delivery=delivery.id)
         try:
-            error, gone = await self._send(client, delivery)
+            parent = await run_in_threadpool(self.webhooks.traceparent, delivery) if self._traces.on else None
+            span = self._traces.span("webhook", parent, webhook=delivery.webhook_id, delivery=delivery.id)
+            error, gone = await self._send(client, delivery, span.traceparent)
+            span.end(error)
+            self._count("failed" if error else "delivered")
             if not error:
                 await run_in_threadpool(self.webhooks.delivered, delivery)
                 bound.info("delivered")
@@ -76,7 +90,7 @@ class Deliverer:
         except SQLAlchemyError as trouble:
             bound.warning("the outcome is not recorded, it will be sent again", error=str(trouble))
 
-    async def _send(self, client: httpx.AsyncClient, delivery: Delivery) -> tuple[str, bool]:
+    async def _send(self, client: httpx.AsyncClient, delivery: Delivery, traceparent: str | None) -> tuple[str, bool]:
         """-> what went wrong, if anything, and whether the receiver wants nothing more."""
         now = datetime.now(UTC)
         try:
@@ -89,6 +103,7 @@ class Deliverer:
                     "webhook-id": delivery.id,
                     "webhook-timestamp": str(int(now.timestamp())),
                     "webhook-signature": Webhook(delivery.secret).sign(delivery.id, now, delivery.body),
+                    **({} if traceparent is None else {"traceparent": traceparent}),
                 }
                 request = client.build_request(
                     "POST",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 
 import structlog
@@ -23,6 +23,7 @@ from advtex_store.fair_queue import WaitingJob
 from advtex_store.queue import WorkerClass, attempt_of, rq_id
 from advtex_store.retention import Retention
 from advtex_store.store import Store
+from advtex_store.tracing import OFF, Traces
 from advtex_store.troubles import ADOPT
 
 SPOOL_SECONDS = 86400.0  # leftovers of killed uploads are removed after this long
@@ -33,6 +34,8 @@ TOO_LARGE = (
     "it needs more memory than the {gib} GiB of the largest worker that is running; start a larger one, or submit it "
     "again with smaller views or a smaller texture"
 )
+
+Timed = Callable[[str, Callable[[], object]], object]
 
 log = structlog.get_logger("advtex.dispatch")
 
@@ -75,11 +78,22 @@ class Held:
 
 
 class Dispatcher:
-    """Two rhythms in one task: look for waiting jobs, and reconcile."""
+    """Two rhythms in one task: look for waiting jobs, and reconcile.
 
-    def __init__(self, store: Store, settings: ServerSettings) -> None:
+    timed: called with the kind of each round and what does it.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        settings: ServerSettings,
+        timed: Timed = lambda _kind, act: act(),
+        traces: Traces = OFF,
+    ) -> None:
         self.store = store
+        self._traces = traces
         self.settings = settings
+        self._timed = timed
         self.retention = Retention(store.database, store.blobs)
         self._woken = asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -101,8 +115,8 @@ class Dispatcher:
             try:
                 if due:
                     reconciled = time.monotonic()
-                    await run_in_threadpool(self.reconcile)
-                await run_in_threadpool(self.dispatch)
+                    await run_in_threadpool(self._timed, "reconcile", self.reconcile)
+                await run_in_threadpool(self._timed, "dispatch", self.dispatch)
                 if self._ill:
                     log.info("dispatching again")
                 self._ill = False
@@ -229,3 +243,8 @@ class Dispatcher:
         with suppress(StaleAttempt):
             state = self.store.records.lost(job_id, attempt, expired_only=True)
             log.warning("lease expired", job=job_id, attempt=attempt, state=state)
+            if self._traces.on:
+                lost = self._traces.span(
+                    "lost", self.store.records.job(job_id).traceparent, job=job_id, attempt=attempt
+                )
+                lost.end("its worker died or cannot be reached", state=state)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import redis
 
-from advtex_store.accounts import Accounts
+from advtex_store.accounts import SCOPES, Accounts
 from advtex_store.secrecy import public_environment
 from advtex_store.supervision import Supervised
 
@@ -102,7 +102,7 @@ def client_key(data_dir: Path, accounts: Accounts, url: str) -> str:
     except (FileNotFoundError, ValueError, AttributeError):
         key = ""
     if accounts.authenticate(key) is None:
-        key = accounts.create_key("embedded", owner="embedded")
+        key = accounts.create_key("embedded", owner="embedded", scopes=SCOPES)
     write_private(path, json.dumps({"url": url, "api_key": key}))
     return key
 

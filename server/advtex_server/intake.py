@@ -30,6 +30,7 @@ from advtex_store.errors import BlobNotFound, QuotaExceeded, RecordNotFound, Sto
 from advtex_store.models import UploadRow
 from advtex_store.partials import Hold, Partial
 from advtex_store.store import Store
+from advtex_store.tracing import OFF, Traces
 
 if TYPE_CHECKING:
     from hashlib import _Hash
@@ -53,9 +54,10 @@ class Checksum:
 class Intake:
     """Uploads as requests see them."""
 
-    def __init__(self, store: Store, settings: ServerSettings) -> None:
+    def __init__(self, store: Store, settings: ServerSettings, traces: Traces = OFF) -> None:
         self.store = store
         self.settings = settings
+        self.traces = traces
         self.digests = Digests()
 
     def create(
@@ -242,7 +244,10 @@ class Receiving:
                 ErrorCode.checksum_mismatch,
                 f"the bytes have sha256 {sha256}, announced was {announced}; send them again",
             )
-        row = self._intake.store.uploads.finish(self.row.id, sha256, self.row.kept_by)
+        facts = {"upload": self.row.id, "owner": self.row.owner, "bytes": self.row.size}
+        span = self._intake.traces.span("upload", None, start=self.row.created_at, **facts)
+        row = self._intake.store.uploads.finish(self.row.id, sha256, self.row.kept_by, span.traceparent)
+        span.end()
         self._digest = None
         log.info("upload complete", upload=row.id, bytes=row.size, sha256=sha256)
         return upload_view(row)

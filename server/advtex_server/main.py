@@ -5,20 +5,24 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
+from sqlalchemy.exc import SQLAlchemyError
 
 from advtex_options.flags import version_flag
 from advtex_server.embedded import SetupError
+from advtex_server.fleet import look_at_fleet
 from advtex_server.health import checks
 from advtex_server.serving import dispatch as run_dispatcher
 from advtex_server.serving import serve as run_server
 from advtex_server.serving import up as run_all
 from advtex_server.settings import ServerSettings
+from advtex_server.top import show
 from advtex_store.accounts import SCOPES, Accounts
 from advtex_store.consistency import Disagreement, disagreements
 from advtex_store.database import Database, migrate_database, upgrade_database
@@ -109,6 +113,18 @@ def doctor(
     store.close()
     if broken or left:
         raise typer.Exit(1 if broken else 3)
+
+
+@app.command()
+def top(
+    seconds: Annotated[float, typer.Option(min=0.2, help="between two looks")] = 2.0,
+    once: Annotated[bool, typer.Option("--once", help="one picture, of all workers, and no more")] = False,
+) -> None:
+    """Watch the fleet: workers and what they do, who waits, what the last day brought, what failed. Ctrl-C ends it."""
+    store = open_store(ServerSettings())
+    with suppress(KeyboardInterrupt), _told(SQLAlchemyError):
+        show(lambda: look_at_fleet(store), seconds, Console(), once=once)
+    store.close()
 
 
 @app.command()

@@ -37,6 +37,7 @@ from advtex_store.models import JobRow
 from advtex_store.results import StoredFile
 from advtex_store.store import Store
 from advtex_store.submissions import JobFilter, Reservation
+from advtex_store.tracing import OFF, Traces
 
 IN_CHECK = "its scan is being checked"
 IN_LINE = "a worker takes it when its turn comes"
@@ -49,10 +50,17 @@ log = structlog.get_logger("advtex.server")
 class Service:
     """What a caller can do. `wake` is called when there is a scan to check, or a job for the workers."""
 
-    def __init__(self, store: Store, settings: ServerSettings, wake: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self,
+        store: Store,
+        settings: ServerSettings,
+        wake: Callable[[], None] = lambda: None,
+        traces: Traces = OFF,
+    ) -> None:
         self.store = store
         self.settings = settings
         self.wake = wake
+        self.traces = traces
         self.batches = BatchService(store, wake)
 
     def storage(self) -> StorageInfo:
@@ -92,10 +100,15 @@ class Service:
             reservation = held
         try:
             _check_method(spec.options.method)
-            self._look(owner, spec)
+            span = self.traces.span("submit", self._look(owner, spec), owner=owner, batch=spec.batch)
             row = self.store.submissions.create_job(
-                owner, spec, reservation=reservation, max_active_jobs=caller.max_active_jobs
+                owner,
+                spec,
+                reservation=reservation,
+                max_active_jobs=caller.max_active_jobs,
+                traceparent=span.traceparent,
             )
+            span.end(job=row.id)
         except BaseException:
             if reservation is not None:
                 self.store.submissions.release(reservation)
@@ -180,8 +193,8 @@ class Service:
         row = self.store.records.job(job_id, owner)
         return None if row.state == JobState.succeeded else self.store.live.read(job_id, row.attempt)
 
-    def _look(self, owner: str, spec: JobSpec) -> None:
-        """What can be said of the scan without reading it: whether it is there, and may be read."""
+    def _look(self, owner: str, spec: JobSpec) -> str | None:
+        """What can be said of the scan without reading it: whether it is there, and may be read. -> its traceparent"""
         if spec.source is not None:
             try:
                 self.store.references.look(spec.source)
@@ -189,13 +202,14 @@ class Service:
                 remedy = "give the URL of a scan that the server can read, or upload it"
                 detail = ErrorDetail(code="source", where="body.source", message=str(error), remedy=remedy)
                 raise ApiError(ErrorCode.invalid_source, str(error), [detail]) from error
-            return
+            return None
         assert spec.upload_id is not None
         upload = self.store.uploads.upload(spec.upload_id, owner)
         if upload.sha256 is None:
             state = f"{upload.offset} of {upload.size}"
             raise ApiError(ErrorCode.not_ready, f"upload {upload.id} is not complete: {state}")
         self.store.blobs.head(keys.scan_key(upload.id))
+        return upload.traceparent
 
 
 def job_view(row: JobRow) -> JobView:

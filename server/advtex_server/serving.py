@@ -11,14 +11,18 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 
 import uvicorn
+from starlette.types import ASGIApp
 
 from advtex_options.methods import known_methods
 from advtex_server.app import create_app
+from advtex_server.authentication import Authenticator
 from advtex_server.background import Background
 from advtex_server.embedded import EmbeddedRedis, SetupError, client_key, only_one
+from advtex_server.metrics import Metrics
+from advtex_server.metrics_access import MetricsAccess, metrics_app
 from advtex_server.settings import ServerSettings
 from advtex_store.accounts import Accounts, key_id
 from advtex_store.database import Database, upgrade_database
@@ -26,6 +30,7 @@ from advtex_store.secrecy import hide_environment
 from advtex_store.sessions import Sessions
 from advtex_store.store import open_store
 from advtex_store.supervision import Supervised
+from advtex_store.tracing import open_traces
 
 WORKER_STOP_SECONDS = 60.0  # a worker writes its checkpoint in this time
 WATCH_SECONDS = 0.5
@@ -57,10 +62,13 @@ async def _dispatch(settings: ServerSettings) -> None:
     stopping = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stopping.set)
-    store = open_store(settings)
-    async with Background(store, settings).running():
+    store, traces = open_store(settings), open_traces("advtex-dispatcher")
+    metrics = Metrics(store, settings.metrics_owners)
+    access = MetricsAccess(metrics, Authenticator(store.accounts, settings.auth_failures_per_minute), settings)
+    async with _metrics(access, settings, "0.0.0.0"), Background(store, settings, metrics, traces).running():  # noqa: S104
         print(json.dumps({"event": "ready", "pid": os.getpid()}), flush=True)
         await stopping.wait()
+    await asyncio.to_thread(traces.close)
     store.close()
 
 
@@ -122,15 +130,7 @@ async def _run(
     # for a tenth of a second.
     gc.collect()
     gc.freeze()
-    server = _Server(
-        uvicorn.Config(
-            app,
-            log_config=None,
-            access_log=False,
-            timeout_graceful_shutdown=settings.shutdown_seconds,
-            server_header=False,
-        )
-    )
+    server = _server(app, settings)
 
     def stop() -> None:
         server.force_exit = server.should_exit  # the second signal does not wait for open requests
@@ -144,12 +144,40 @@ async def _run(
         loop.add_signal_handler(number, stop)
     watcher = asyncio.create_task(_watch(server, children, ready))
     try:
-        await server.serve(sockets=[listener])
+        async with _metrics(app.state.metrics_access, settings, listener.getsockname()[0]):
+            await server.serve(sockets=[listener])
     finally:
         watcher.cancel()
         for child in reversed(children):
             child.ask_to_stop()
             await asyncio.to_thread(child.wait)
+
+
+def _server(app: ASGIApp, settings: ServerSettings) -> _Server:
+    config = uvicorn.Config(
+        app,
+        log_config=None,
+        access_log=False,
+        timeout_graceful_shutdown=settings.shutdown_seconds,
+        server_header=False,
+    )
+    return _Server(config)
+
+
+@contextlib.asynccontextmanager
+async def _metrics(access: MetricsAccess, settings: ServerSettings, host: str) -> AsyncIterator[None]:
+    """Serve the metrics at a port of their own, if they have one. SetupError."""
+    if settings.metrics_port is None:
+        yield
+        return
+    with _listen(host, settings.metrics_port) as listener:
+        server = _server(metrics_app(access), settings)
+        serving = asyncio.create_task(server.serve(sockets=[listener]))
+        try:
+            yield
+        finally:
+            server.should_exit = True
+            await serving
 
 
 async def _watch(server: uvicorn.Server, children: Sequence[Supervised], ready: Callable[[], None]) -> None:

@@ -29,4 +29,16 @@ class ServerSettings(StoreSettings):
     webhook_networks: tuple[IPvAnyNetwork, ...] = Field(
         default=(), description="networks that are not public and that webhooks may go to, as a JSON list"
     )
+    metrics_port: int | None = Field(
+        default=None, ge=1, le=65535, description="/metrics is served there, and nowhere else"
+    )
+    metrics_key: bool = Field(default=False, description="/metrics asks for a key with the scope admin")
+    metrics_owners: int = Field(
+        default=10, ge=0, description="owners named in metrics, which they are with one of the two above only"
+    )
     shutdown_seconds: int = Field(default=5, gt=0, description="open requests get this long when the server stops")
+
+    @property
+    def metrics_guarded(self) -> bool:
+        """Whether not everybody who reaches the API reads the metrics."""
+        return self.metrics_key or self.metrics_port is not None

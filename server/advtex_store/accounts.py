@@ -17,7 +17,7 @@ from advtex_store.database import Database
 from advtex_store.errors import QuotaExceeded, RecordNotFound
 from advtex_store.models import ApiKeyRow, JobRow, UploadRow
 
-SCOPES = ("read", "write")
+SCOPES = ("read", "write", "admin")  # admin: sees how the whole fleet is, and whose jobs wait
 LONGEST_NAME = 255  # PostgreSQL insists on the width of a column, SQLite does not
 _KEY = re.compile(r"adv_([0-9a-f]{12})_([A-Za-z0-9]{40})")
 _ALPHABET = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789"

@@ -43,6 +43,7 @@ class CheckClaim:
     scan_key: str
     source: str | None
     options: JobOptions
+    traceparent: str | None = None
 
 
 class Checks:
@@ -184,4 +185,5 @@ def _claim(row: JobRow) -> CheckClaim:
         scan_key=keys.scan_key(row.upload_id),
         source=row.source,
         options=JobOptions.model_validate(known_options(row.options)),
+        traceparent=row.traceparent,
     )

@@ -13,23 +13,42 @@ from sqlalchemy.orm import Session
 from advtex_contract.jobs import JobState
 from advtex_store.database import Database
 from advtex_store.ids import created_at
-from advtex_store.models import KEPT, WAITS_IN_LINE, CounterRow, DeliveryRow, JobRow
+from advtex_store.models import KEPT, WAITS_IN_LINE, CounterRow, DeliveryRow, JobRow, WebhookRow
 
 # In the order in which one transaction may count: all in the same, or two of them could wait for each other.
 ATTEMPTS = "attempts"  # ended early, by how: lost, preempted
 FAILURES = "failures"  # jobs that failed or were rejected, by the error's code
 JOBS = "jobs"  # ended, by state
+STAGE_BUCKETS = "stage_buckets"  # the same times, counted by stage and the bound that they stay below: `atlas 30`
 STAGES = "stages"  # seconds, of jobs that ended
+
+STAGE_BOUNDS = (1, 3, 10, 30, 60, 180, 600, 1800, 3600, 10_800, 36_000)  # seconds
+
+
+@dataclass(frozen=True, slots=True)
+class RunningJob:
+    """An attempt at work, and its steps per second."""
+
+    id: str
+    attempt: int
+    memory_gib: int
+    steps_per_second: float
 
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """What there is to do now: the age of the oldest job that waits in seconds, steps per second of all that run, and
-    webhook deliveries that wait."""
+    """What there is to do now: the age of the oldest job that waits in seconds, jobs that run, webhook deliveries that
+    wait, and for how many seconds the most urgent of them has been due at a webhook that is not disabled."""
 
     oldest_seconds: float
-    steps_per_second: float
+    running: list[RunningJob]
     deliveries: int
+    overdue_seconds: float
+
+    @property
+    def steps_per_second(self) -> float:
+        """Of all together."""
+        return sum(job.steps_per_second for job in self.running)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +80,9 @@ def count_end(
     if error is not None:
         count_one(session, FAILURES, str(error["code"]))
     count_one(session, JOBS, state)
+    for stage, seconds in sorted(stage_seconds.items()):
+        if bound := next((bound for bound in STAGE_BOUNDS if seconds <= bound), None):
+            count_one(session, STAGE_BUCKETS, f"{stage} {bound}")
     for stage, seconds in sorted(stage_seconds.items()):
         count_one(session, STAGES, stage, seconds)
 
@@ -100,7 +122,15 @@ class Counters:
                 )
                 for state in (JobState.queued, JobState.preempted)
             ]
-            running = session.scalars(select(JobRow.progress).where(JobRow.state == JobState.running, KEPT))
-            rate = sum(progress.get("steps_per_second") or 0.0 for progress in running)
+            columns = select(JobRow.id, JobRow.attempt, JobRow.memory_gib, JobRow.progress)
+            running = [
+                RunningJob(job_id, attempt, gib, progress.get("steps_per_second") or 0.0)
+                for job_id, attempt, gib, progress in session.execute(
+                    columns.where(JobRow.state == JobState.running, KEPT)
+                )
+            ]
             deliveries = session.scalar(select(func.count()).select_from(DeliveryRow)) or 0
-        return Load(max((now - made for made in oldest if made is not None), default=0.0), rate, deliveries)
+            due = select(DeliveryRow.next_try_at).join(WebhookRow).where(WebhookRow.disabled_at.is_(None))
+            first = session.scalar(due.order_by(DeliveryRow.next_try_at).limit(1))
+        age = max((now - made for made in oldest if made is not None), default=0.0)
+        return Load(age, running, deliveries, 0.0 if first is None else max(0.0, now - first))

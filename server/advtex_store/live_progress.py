@@ -14,8 +14,11 @@ from redis import Redis, RedisError
 
 from advtex_contract.jobs import JobState, Progress
 from advtex_store.models import JobRow
+from advtex_store.queue import rq_id
 
 KEY = "advtex:progress:"
+CHECKPOINT = "advtex:checkpoint:"
+CHECKPOINT_SECONDS = 7 * 86400  # a key lives so long, and tells by what is left how old it is: no clocks are compared
 KEPT_SECONDS = 10  # longer than it takes until the row says the same
 REST_SECONDS = 5.0  # after Redis did not answer; meanwhile nobody waits for it again
 
@@ -43,6 +46,18 @@ class LiveProgress:
             found = json.loads(told) if told else {}
             if found.get("attempt") == row.attempt:  # a stale attempt may go on for a moment
                 row.progress, row.waiting_reason = found["progress"], found["waiting_reason"]
+
+    def saved(self, job_id: str, attempt: int) -> None:
+        """All that the attempt has done so far would outlive it: it has just begun, or has a new checkpoint."""
+        self._ask(lambda: self.redis.set(CHECKPOINT + rq_id(job_id, attempt), "", ex=CHECKPOINT_SECONDS))
+
+    def checkpoint_ages(self, attempts: Sequence[tuple[str, int]]) -> list[float]:
+        """Seconds since each (job, attempt) was `saved`; without those of which nothing is known."""
+        pipeline = self.redis.pipeline(transaction=False)
+        for job_id, attempt in attempts:
+            pipeline.pttl(CHECKPOINT + rq_id(job_id, attempt))
+        left = self._ask(pipeline.execute) or []
+        return [CHECKPOINT_SECONDS - milliseconds / 1000 for milliseconds in left if milliseconds >= 0]
 
     def _ask(self, ask: Callable[[], T]) -> T | None:
         if time.monotonic() < self._rest_until:

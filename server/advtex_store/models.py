@@ -29,6 +29,7 @@ WAITS_FOR_ITS_TURN = text("'' || state || '' in ('preempted', 'queued') and dele
 WAITS_FOR_A_REASON = text("'' || state in ('preempted', 'queued') and deleted_at is null")
 KEPT = text("deleted_at is null")
 UNTIDY = text("state = 'succeeded' and tidied_at is null and deleted_at is null")
+ENDED = text("finished_at is not null and deleted_at is null")
 UNPURGED = text("deleted_at is not null and purged_at is null")
 
 
@@ -80,7 +81,7 @@ class UploadRow(Base):
     offset: bytes that are durable; all of them from right before the blob gets its name. holder: the newest request for
     the bytes; only that one may move the offset. kept_by: the request that moved it last.
     announced_sha256: what the client says that the bytes will have; the bytes' own once they are complete.
-    tus_metadata: as the client gave it. source: as in its job.
+    tus_metadata: as the client gave it. source: as in its job. traceparent: of the span of the whole upload.
     """
 
     __tablename__ = "uploads"
@@ -96,6 +97,7 @@ class UploadRow(Base):
     kept_by: Mapped[str | None]
     tus_metadata: Mapped[str] = mapped_column(Text, default="")
     source: Mapped[str | None] = mapped_column(Text)
+    traceparent: Mapped[str | None]
     created_at: Mapped[float]
     expires_at: Mapped[float | None]
     deleted_at: Mapped[float | None]
@@ -125,6 +127,7 @@ class JobRow(Base):
     checked_at: when its scan was found good. Until then `worker`, `lease_expires_at` and `deaths` are the checker's
     (`checks.py`); a time without a worker is when the next check may begin.
     tidied_at: when what no result needs was removed.
+    traceparent: of the span in which it was made (`tracing.py`).
     """
 
     __tablename__ = "jobs"
@@ -160,6 +163,7 @@ class JobRow(Base):
     error: Mapped[dict[str, Any] | None]
     results: Mapped[list[Any]]
     version: Mapped[int] = mapped_column(BigInteger, default=1)
+    traceparent: Mapped[str | None]
     created_at: Mapped[float]
     updated_at: Mapped[float]
     finished_at: Mapped[float | None]
@@ -178,6 +182,7 @@ class JobRow(Base):
         _partial("ix_jobs_turn", "line", "memory_gib", "state", "due", "id", where=WAITS_FOR_ITS_TURN),
         _partial("ix_jobs_reason", "memory_gib", "waiting_reason", where=WAITS_FOR_A_REASON),
         _partial("ix_jobs_expires_at", "expires_at", where=KEPT),
+        _partial("ix_jobs_finished_at", "finished_at", where=ENDED),
         _partial("ix_jobs_untidy", "finished_at", where=UNTIDY),
         _partial("ix_jobs_unpurged", "id", where=UNPURGED),
     )

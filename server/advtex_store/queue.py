@@ -133,7 +133,7 @@ class JobQueue:
     def workers(self, host: str = "") -> list[str]:
         """Names of the living workers, of one host or of all."""
         found = self.redis.scan_iter(match=PRESENCE + "*", count=SCANNED)
-        names = sorted(_text(key).removeprefix(PRESENCE) for key in found)
+        names = sorted(text_of(key).removeprefix(PRESENCE) for key in found)
         return [name for name in names if not host or name.rpartition("-")[0] == host]
 
     def busy_workers(self, host: str) -> list[str]:
@@ -144,7 +144,7 @@ class JobQueue:
         """What the living workers tell, by their names."""
         names = self.workers(host)
         told = self.redis.mget([PRESENCE + name for name in names]) if names else []
-        return {name: _text(value) for name, value in zip(names, told, strict=True) if value is not None}
+        return {name: text_of(value) for name, value in zip(names, told, strict=True) if value is not None}
 
     def classes(self) -> list[WorkerClass]:
         """The classes of which workers live, smallest first."""
@@ -192,7 +192,7 @@ class JobQueue:
         pipeline = self.redis.pipeline()
         pipeline.zremrangebyscore(DECLINED, "-inf", time.time())
         pipeline.zrange(DECLINED, 0, -1)
-        return [_text(name) for name in pipeline.execute()[1]]
+        return [text_of(name) for name in pipeline.execute()[1]]
 
     def tell_near(self, host: str, names: Sequence[str]) -> None:
         """Of what waits, the attempts (`job-attempt`) whose scans the machine has."""
@@ -219,7 +219,7 @@ class JobQueue:
         """Take back what waits for workers of classes that are not in `keep`: nobody listens there any more."""
         kept = {queue_name(gib) for gib in keep}
         for raw in self.redis.smembers(Queue.redis_queues_keys):
-            name = _text(raw).removeprefix(Queue.redis_queue_namespace_prefix)
+            name = text_of(raw).removeprefix(Queue.redis_queue_namespace_prefix)
             if not name.startswith(QUEUE) or name in kept:
                 continue
             self._remove(name, 0)
@@ -234,7 +234,7 @@ class JobQueue:
 
     def _remove(self, queue: str, first: int) -> list[str]:
         key = _key(queue)
-        return self._take(key, [_text(raw) for raw in self.redis.lrange(key, first, -1)])
+        return self._take(key, [text_of(raw) for raw in self.redis.lrange(key, first, -1)])
 
     def _take(self, key: str, names: Sequence[str]) -> list[str]:
         removed = []
@@ -254,7 +254,7 @@ class JobQueue:
         pipeline = self.redis.pipeline(transaction=False)
         for gib in classes:
             pipeline.lrange(_key(queue_name(gib)), 0, -1)
-        return {gib: [_text(name) for name in found] for gib, found in zip(classes, pipeline.execute(), strict=True)}
+        return {gib: [text_of(name) for name in found] for gib, found in zip(classes, pipeline.execute(), strict=True)}
 
     def _fetch(self, name: str) -> Job:
         return Job.fetch(name, connection=self.redis, serializer=JSONSerializer)
@@ -283,5 +283,6 @@ def _key(name: str) -> str:
     return f"{Queue.redis_queue_namespace_prefix}{name}"
 
 
-def _text(raw: bytes | str) -> str:
+def text_of(raw: bytes | str) -> str:
+    """What Redis has answered."""
     return raw.decode() if isinstance(raw, bytes) else raw

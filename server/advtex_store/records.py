@@ -36,6 +36,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import and_, func, select, update
+from sqlalchemy.orm import Session
 
 from advtex_contract.errors import ErrorDetail
 from advtex_contract.jobs import RETRYABLE, TERMINAL, WAITING, JobError, JobState, Progress
@@ -79,6 +80,8 @@ class Claim:
     options: JobOptions
     progress: Progress  # of earlier attempts
     lease: Lease
+    traceparent: str | None = None
+    waiting_since: float | None = None  # of a job that has a trace
 
 
 class Records(Transitions):
@@ -116,6 +119,8 @@ class Records(Transitions):
                 options=JobOptions.model_validate(known_options(row.options)),
                 progress=Progress.model_validate(row.progress),
                 lease=Lease(expires_at, row.cancel_requested),
+                traceparent=row.traceparent,
+                waiting_since=None if row.traceparent is None else _waiting_since(session, row),
             )
 
     def decline(self, job_id: str, attempt: int, reason: str) -> None:
@@ -371,6 +376,13 @@ class Records(Transitions):
             self.finish(
                 session, self.move(session, job_id, to, sources=frozenset({S.running}), fence=attempt, error=data)
             )
+
+
+def _waiting_since(session: Session, row: JobRow) -> float | None:
+    """When it began to wait for the attempt that was just claimed: the change of state before that one."""
+    before = select(EventRow.data).where(EventRow.job_id == row.id, EventRow.version < row.version)
+    data = session.scalar(before.order_by(EventRow.version.desc()).limit(1)) or {}
+    return data.get("at")
 
 
 def _released(next_attempt: int) -> dict[str, Any]:

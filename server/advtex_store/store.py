@@ -10,6 +10,7 @@ from advtex_store.blobs import Blobs
 from advtex_store.checks import Checks
 from advtex_store.counters import Counters
 from advtex_store.database import Database
+from advtex_store.fleet import Fleet
 from advtex_store.live import Live
 from advtex_store.live_progress import LiveProgress
 from advtex_store.overviews import Overviews
@@ -49,6 +50,7 @@ class Store:
     counters: Counters
     troubles: Troubles
     queue: JobQueue
+    fleet: Fleet
 
     def close(self) -> None:
         """Close connections."""
@@ -63,6 +65,7 @@ def open_store(settings: StoreSettings) -> Store:
     retention = settings.retention_seconds
     records = Records(database, lease_seconds=settings.lease_seconds)
     blobs = open_blobs(settings.blobs, settings.spool_dir)
+    queue = JobQueue(connect_redis(settings))
     return Store(
         settings=settings,
         database=database,
@@ -82,5 +85,6 @@ def open_store(settings: StoreSettings) -> Store:
         webhooks=Webhooks(database),
         counters=Counters(database),
         troubles=Troubles(database, blobs),
-        queue=JobQueue(connect_redis(settings)),
+        queue=queue,
+        fleet=Fleet(queue),
     )

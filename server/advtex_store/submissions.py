@@ -109,6 +109,7 @@ class Submissions:
         *,
         reservation: Reservation | None = None,
         max_active_jobs: int | None = None,
+        traceparent: str | None = None,
     ) -> JobRow:
         """A job whose scan is to be checked (`Checks`). RecordNotFound: no such finished upload.
 
@@ -140,6 +141,7 @@ class Submissions:
                 created_at=now,
                 updated_at=now,
                 retention_seconds=retention,
+                traceparent=traceparent,
             )
             session.add(row)
             session.flush()

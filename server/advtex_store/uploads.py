@@ -126,7 +126,9 @@ class Uploads:
                 raise _superseded(upload_id)
             return expires_at
 
-    def finish(self, upload_id: str, sha256: str, kept_by: str | None = None) -> UploadRow:
+    def finish(
+        self, upload_id: str, sha256: str, kept_by: str | None = None, traceparent: str | None = None
+    ) -> UploadRow:
         """The blob is durable. Finishing again with the same sha256 changes nothing.
 
         kept_by: the request that told of all its bytes, None if they came by none. Whoever then gives the blob its name
@@ -144,6 +146,7 @@ class Uploads:
                 raise _superseded(upload_id)
             row.sha256, row.announced_sha256, row.offset, row.holder = sha256, sha256, row.size, None
             row.expires_at = self.database.now(session) + self.retention_seconds
+            row.traceparent = traceparent
             return row
 
     def expected_bytes(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import secrets
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -148,6 +149,12 @@ class Webhooks:
                 .values(next_try_at=resumes)
             )
             return hook.disabled_at is not None
+
+    def traceparent(self, delivery: Delivery) -> str | None:
+        """Of the job that it tells of."""
+        job_id = json.loads(delivery.body)["data"]["id"]
+        with self.database.read() as session:
+            return session.scalar(select(JobRow.traceparent).where(JobRow.id == job_id))
 
     def drop_old(self) -> int:
         """Forget what could not be delivered for long. -> how many there were."""

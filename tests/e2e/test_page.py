@@ -442,6 +442,8 @@ def test_quick_look_gets_the_usdz_without_the_session(web: Browsing, archive: Pa
 def test_every_page_is_open_to_all_and_fits_every_screen(web: Browsing, axe: str, archive: Path) -> None:
     """axe-core finds nothing serious, nothing is wider than the screen, and without the viewer the model is seen in
     pictures. Those that are written here are for people to look at."""
+    from crowd import gather
+
     with web.service.client() as client:
         jobs = {job.state.value: job.id for job in client.list_jobs()}
         spec = JobSpec(upload_id=client.upload(archive).id, label="for the pictures", batch="night")
@@ -456,6 +458,11 @@ def test_every_page_is_open_to_all_and_fits_every_screen(web: Browsing, axe: str
         if name == "succeeded":
             expect(page.get_by_role("slider", name="Turn the model")).to_be_visible()
         look_at_all_sizes(page, name, web.pictures, axe)
+    gather(web.service.store)
+    page.goto("/fleet")
+    page.locator("#failures summary").first.click()
+    expect(page.get_by_role("list").filter(has_text="gpu-node-9-7")).to_contain_text(HOSTILE)
+    look_at_all_sizes(page, "fleet", web.pictures, axe)
     page.get_by_role("button", name="Sign out").click()
     page.get_by_label("Key").wait_for()
     look_at_all_sizes(page, "sign-in", web.pictures, axe)

@@ -17,7 +17,7 @@ from redis.exceptions import RedisError
 
 from advtex_client import Client
 from advtex_server.embedded import free_port, redis_binary
-from advtex_store.accounts import Accounts
+from advtex_store.accounts import SCOPES, Accounts
 from advtex_store.settings import StoreSettings
 from advtex_store.store import Store, open_store
 
@@ -77,7 +77,7 @@ class LiveService:
             data_dir=folder / "data", blob_url=blob_url, redis_url=self.environment["ADVTEX_REDIS_URL"]
         )
         self.store: Store = open_store(places)
-        self.key = Accounts(self.store.database).create_key("tests", owner="tests")
+        self.key = Accounts(self.store.database).create_key("tests", owner="tests", scopes=SCOPES)
 
     def start_redis(self) -> subprocess.Popen[bytes]:
         options = ["--port", str(self.redis_port), "--bind", "127.0.0.1", "--save", "", "--appendonly", "no"]

@@ -52,6 +52,7 @@ from advtex_worker.live import LivePoster
 from advtex_worker.progress import ProgressTracker
 from advtex_worker.scan_cache import ScanCache, cache_name
 from advtex_worker.settings import WorkerSettings
+from advtex_worker.tracing import NOT_TRACED, AttemptTrace
 from advtex_worker.workspace import workspace_of
 
 RETRY_SECONDS = 5.0
@@ -79,9 +80,16 @@ class Attempt:
     """
 
     def __init__(
-        self, store: Store, settings: WorkerSettings, engine: str, claim: Claim, gib: int | None = None
+        self,
+        store: Store,
+        settings: WorkerSettings,
+        engine: str,
+        claim: Claim,
+        gib: int | None = None,
+        trace: AttemptTrace = NOT_TRACED,
     ) -> None:
         self._store = store
+        self._trace = trace
         self._settings = settings
         self._engine = engine
         self._job_id = claim.job_id
@@ -151,7 +159,9 @@ class Attempt:
         self._check_ending()
         self._warnings = base.warnings
         self._log.info("attempt begins", resumed_files=len(base.files))
-        uploader = CheckpointUploader(self._store.blobs, self._job_id, self._number, base, self._keeper.held)
+        saved = partial(self._store.live_progress.saved, self._job_id, self._number)
+        saved()
+        uploader = CheckpointUploader(self._store.blobs, self._job_id, self._number, base, self._keeper.held, saved)
         poster = LivePoster(self._store.live, self._job_id, self._number, self._keeper.held)
         ended: FinishedEvent | FailedEvent | StoppedEvent | None = None
         try:
@@ -219,6 +229,7 @@ class Attempt:
             match event:
                 case StageEvent():
                     tracker.stage(event)
+                    self._trace.stage(event)
                 case ProgressEvent():
                     tracker.progress(event)
                 case WarningEvent():

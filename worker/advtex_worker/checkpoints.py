@@ -98,12 +98,22 @@ def _index_key(job_id: str, attempt: int) -> str:
 
 
 class CheckpointUploader:
-    """Uploads snapshots on a thread of its own; what a newer snapshot replaces while it waits is skipped."""
+    """Uploads snapshots on a thread of its own; what a newer snapshot replaces while it waits is skipped.
+
+    on_saved: called after each checkpoint that is complete.
+    """
 
     def __init__(
-        self, blobs: Blobs, job_id: str, attempt: int, base: CheckpointIndex, still_held: Callable[[], bool]
+        self,
+        blobs: Blobs,
+        job_id: str,
+        attempt: int,
+        base: CheckpointIndex,
+        still_held: Callable[[], bool],
+        on_saved: Callable[[], None] = lambda: None,
     ) -> None:
         self._blobs = blobs
+        self._on_saved = on_saved
         self._still_held = still_held
         self._job_id = job_id
         self._attempt = attempt
@@ -181,6 +191,7 @@ class CheckpointUploader:
         index = CheckpointIndex(sequence=sequence, files=files, warnings=self._warnings)
         self._blobs.put(_index_key(self._job_id, self._attempt), index.model_dump_json().encode())
         before, self._committed = self._committed, index
+        self._on_saved()
         named = {file.key for file in files.values()}
         for file in before.files.values():  # earlier attempts' files stay: their own index still names them
             if file.key not in named and file.key.startswith(prefix):

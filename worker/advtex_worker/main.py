@@ -12,6 +12,7 @@ import os
 import signal
 import socket
 import sys
+import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -29,10 +30,12 @@ from sqlalchemy.exc import SQLAlchemyError
 from advtex_scan.version import product_version
 from advtex_store.database import read_schema
 from advtex_store.errors import SchemaRefused
+from advtex_store.fleet import Fleet, WorkerReport
 from advtex_store.logs import configure_logs
 from advtex_store.process_ends import die_with_parent
 from advtex_store.queue import JobQueue, attempt_of, class_of, connect_redis, queue_name
 from advtex_store.secrecy import hide_environment
+from advtex_worker.gpu_readings import GpuWatch
 from advtex_worker.leaving import STOP_SIGNALS, Departure, Reason, Stay, add_arguments, parent_of, read_stay
 from advtex_worker.settings import WorkerSettings
 from advtex_worker.slots import Slot, find_slots, hold, settings_of, supervise
@@ -54,13 +57,18 @@ class JobWorker(Worker):
 
     max_connection_wait_time = RECONNECT_SECONDS
 
-    def __init__(self, host: Host, connection: Any, departure: Departure, gib: int) -> None:
+    def __init__(
+        self, host: Host, connection: Any, departure: Departure, gib: int, gpu: GpuWatch | None = None
+    ) -> None:
         self._host = host
         self._departure = departure
         self._gib = gib
         self._parent_pid = os.getpid()
         self._presence = JobQueue(connection)
+        self._fleet = Fleet(self._presence)
+        self._gpu = gpu
         self._busy = False
+        self._report = WorkerReport(host=socket.gethostname(), release=product_version())
         self._leaves = False
         self._known_as = f"{socket.gethostname()}-{self._parent_pid}"
         super().__init__(
@@ -77,6 +85,8 @@ class JobWorker(Worker):
 
     def _announce(self, pipeline: Any = None) -> None:
         self._presence.announce(self._known_as, self._gib, pipeline, busy=self._busy)
+        reading = None if self._gpu is None else self._gpu.newest
+        self._fleet.tell(self._known_as, self._report.model_copy(update={"gpu": reading}), pipeline)
 
     def heartbeat(self, timeout: int | None = None, pipeline: Any = None) -> None:
         super().heartbeat(timeout, pipeline)
@@ -140,17 +150,18 @@ class JobWorker(Worker):
         """The work-horse inherits the context: its lines and RQ's own name the job in both processes."""
         job_id, attempt = attempt_of(job.id)
         with structlog.contextvars.bound_contextvars(job=job_id, attempt=attempt):
-            self._tell(busy=True)
+            self._tell(busy=True, job=job_id, attempt=attempt, since=time.time())
             try:
                 super().execute_job(job, queue)
             finally:
-                self._tell(busy=False)
+                self._tell(busy=False, job="", attempt=0, since=None)
         self._departure.count_job()
         self._stop_requested = self._departure.reason is not None  # RQ looks before it takes another one
 
-    def _tell(self, *, busy: bool) -> None:
+    def _tell(self, *, busy: bool, **attempt: object) -> None:
         """At once: until the next sign of life the dispatcher would count on a worker that has a job."""
         self._busy = busy
+        self._report = self._report.model_copy(update=attempt)
         with suppress(RedisError):
             self._announce()
 
@@ -234,9 +245,10 @@ def work(host: Host, slot: Slot, departure: Departure) -> None:
     gib = class_of(slot.memory_bytes)
     _lock = hold(slot, host.settings.jobs_per_gpu, departure.wait)
     log.info("worker takes jobs", memory_gib=gib, gpu=slot.gpu)
+    gpu = GpuWatch(slot.gpu)
     while departure.reason is None:
         try:
-            worker = JobWorker(host, connect_redis(host.settings), departure, gib)
+            worker = JobWorker(host, connect_redis(host.settings), departure, gib, gpu)
             worker.work(logging_level="WARNING", max_idle_time=departure.stay.idle_seconds)
             if departure.reason is None:
                 log.warning("the connection to Redis broke; connecting again")

@@ -17,6 +17,7 @@ from advtex_store.store import open_store
 from advtex_worker.attempt import Attempt
 from advtex_worker.runner import ENGINE
 from advtex_worker.settings import WorkerSettings
+from advtex_worker.tracing import traced
 from advtex_worker.workspace import sweep
 
 log = structlog.get_logger()
@@ -80,13 +81,14 @@ def run_attempt(host: Host, job_id: str, attempt: int) -> None:
         store.records.decline(job_id, attempt, str(reason))
         store.queue.decline(job_id, attempt)
     else:
-        carried = Attempt(store, host.settings, host.engine, claim, host.gib)
-        host.stop_signal.watch(carried)
-        try:
-            carried.carry()
-        except Exception:  # a flaw of the worker or its surroundings: the next attempt may fare better
-            log.exception("attempt broke", job=job_id, attempt=attempt)
-            with suppress(StaleAttempt):
-                store.records.lost(job_id, attempt, log_tail=traceback.format_exc())
+        with traced(store, claim) as trace:
+            carried = Attempt(store, host.settings, host.engine, claim, host.gib, trace)
+            host.stop_signal.watch(carried)
+            try:
+                carried.carry()
+            except Exception:  # a flaw of the worker or its surroundings: the next attempt may fare better
+                log.exception("attempt broke", job=job_id, attempt=attempt)
+                with suppress(StaleAttempt):
+                    store.records.lost(job_id, attempt, log_tail=traceback.format_exc())
     finally:
         store.close()

@@ -6,11 +6,12 @@ from typing import cast
 
 from fastapi import APIRouter, Request, Response
 
+from advtex_contract.errors import ErrorCode
 from advtex_contract.health import Alive, KeyView, PartView, Readiness
 from advtex_server.deps import Anyone, TheService
 from advtex_server.health import checks
-from advtex_server.metrics import Metrics
-from advtex_server.refusal import WITH_KEY
+from advtex_server.metrics_access import MetricsAccess
+from advtex_server.refusal import WITH_KEY, refuses
 
 router = APIRouter(tags=["operation"])
 
@@ -37,8 +38,12 @@ def get_key(caller: Anyone, service: TheService) -> KeyView:
     return service.key(caller)
 
 
-@router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
-def metrics(request: Request) -> Response:
-    """Prometheus metrics."""
-    body, media_type = cast(Metrics, request.app.state.metrics).exposition()
-    return Response(body, media_type=media_type)
+@router.get(
+    "/metrics",
+    response_class=Response,
+    responses={200: {"content": {"text/plain": {}}}, **WITH_KEY, **refuses(ErrorCode.not_found)},
+)
+async def metrics(request: Request) -> Response:
+    """Prometheus metrics: for everybody, unless the operator has given them a port of their own or lets them ask for a
+    key with the scope `admin`."""
+    return await cast(MetricsAccess, request.app.state.metrics_access).beside_the_api(request)

@@ -26,6 +26,7 @@ from advtex_server.authentication import Authenticator
 from advtex_server.browsers import BrowserSessions, check_same_origin, cookie_name
 from advtex_server.deps import TheService
 from advtex_server.errors import noted
+from advtex_server.fleet import look_at_fleet
 from advtex_server.overview import job_summary, stream_changes
 from advtex_server.refusal import STATUS, ApiError
 from advtex_server.routes.jobs import JobId
@@ -47,7 +48,7 @@ VIEWER_POLICY = (
     .replace("connect-src 'self'", "connect-src 'self' blob:")
 )
 DOCS_POLICY = POLICY.replace("style-src 'self'", "style-src 'self' 'unsafe-inline'")  # Swagger UI styles itself
-_RETURN = re.compile(r"/(new|jobs/[0-9A-Za-z_-]{1,64})?(\?[A-Za-z0-9._%&=-]*)?")
+_RETURN = re.compile(r"/(new|fleet|jobs/[0-9A-Za-z_-]{1,64})?(\?[A-Za-z0-9._%&=-]*)?")
 _WORDS = {
     "states": {
         state: {"label": facts.label, "tone": facts.tone, "terminal": facts.terminal, "retryable": state in RETRYABLE}
@@ -159,6 +160,24 @@ async def errors_page(request: Request) -> Response:
     return _page("errors.html", caller, answers=EXPLANATIONS, jobs=JOB_EXPLANATIONS, statuses=STATUS)
 
 
+@router.get("/fleet")
+async def fleet_page(request: Request, service: TheService) -> Response:
+    """The fleet, for those who run it."""
+    caller = await _admin(request)
+    view = await run_in_threadpool(look_at_fleet, service.store)
+    return _page("fleet.html", caller, data={"fleet": view.model_dump(mode="json"), "owner": caller.owner})
+
+
+@router.get("/fleet/now")
+async def fleet_now(request: Request, service: TheService) -> Response:
+    """The same as JSON, for the page."""
+    caller = await _sessions(request).find(request)
+    if caller is None or "admin" not in caller.scopes:
+        return Response(status_code=401 if caller is None else 403)
+    view = await run_in_threadpool(look_at_fleet, service.store)
+    return Response(view.model_dump_json(), media_type="application/json", headers={"Cache-Control": "no-store"})
+
+
 @router.get("/changes")
 async def changes(
     request: Request, service: TheService, after: int = 0, last_event_id: Annotated[str, Header()] = ""
@@ -234,11 +253,19 @@ def _sessions(request: Request) -> BrowserSessions:
 
 
 async def _reader(request: Request) -> Caller:
+    return await _with_scope(request, "read", "it can send scans, but not look at jobs")
+
+
+async def _admin(request: Request) -> Caller:
+    return await _with_scope(request, "admin", "it sees your own jobs, and not the whole fleet")
+
+
+async def _with_scope(request: Request, scope: str, otherwise: str) -> Caller:
     caller = await _sessions(request).find(request)
     if caller is None:
         raise SignInFirst
-    if "read" not in caller.scopes:
-        raise ApiError(ErrorCode.forbidden, "your key lacks the scope 'read': it can send scans, but not look at jobs")
+    if scope not in caller.scopes:
+        raise ApiError(ErrorCode.forbidden, f"your key lacks the scope '{scope}': {otherwise}")
     return caller
 
 

@@ -172,8 +172,8 @@ class Progress(BaseModel):
 class ResultFile(BaseModel):
     """A file of a finished job, downloadable at `url` (path on the same server) with Range requests.
 
-    kind: the word by which the option `outputs` has it, or "seen", "report", "page" or "previews". purpose: what it is for, in
-    a phrase. Both are empty where they are not known.
+    kind: the word by which the option `outputs` has it, or "seen", "report", "page" or "previews". purpose: what it is
+    for, in a phrase. Both are empty where they are not known.
     """
 
     name: str

@@ -38,6 +38,7 @@ from advtex_contract.jobs import (
     UploadList,
     UploadView,
 )
+from advtex_options.outputs import kind_and_purpose
 
 T = TypeVar("T")
 M = TypeVar("M", bound=BaseModel)
@@ -291,6 +292,27 @@ def chosen_results(job: JobView, names: Sequence[str] | None) -> list[ResultFile
     if unknown:
         raise ClientError(f"job {job.id} has no result {unknown[0]!r}; it has {', '.join(by_name)}")
     return [by_name[name] for name in names] if names else job.results
+
+
+def only_results(job: JobView, words: str) -> list[str]:
+    """Return the names of the results that any of `words` (with commas between) means, in the job's order.
+
+    A word is a file's name, else a kind of file, else an ending. Raises ClientError for one that nothing matches.
+    """
+    chosen = set[str]()
+    for word in (word.strip() for word in words.split(",")):
+        means = (lambda file: file.name, _kind, lambda file: file.name.rpartition(".")[2])
+        found = next(filter(None, ([file.name for file in job.results if mean(file) == word] for mean in means)), [])
+        if not found and job.results:
+            kinds = ", ".join(dict.fromkeys(filter(None, map(_kind, job.results))))
+            raise ClientError(f"job {job.id} has no result {word!r}; give a file's name, its ending, or one of {kinds}")
+        chosen.update(found)
+    return [file.name for file in job.results if file.name in chosen]
+
+
+def _kind(file: ResultFile) -> str:
+    """Servers of older releases tell none."""
+    return file.kind or kind_and_purpose(file.name)[0]
 
 
 def ensure_succeeded(job: JobView) -> JobView:

@@ -47,6 +47,10 @@ AsJson = Annotated[bool, typer.Option("--json", help="print JSON on stdout")]
 Url = Annotated[str | None, typer.Option("--url", help="the server; else ADVTEX_URL or the configuration file")]
 ApiKey = Annotated[str | None, typer.Option("--api-key", help="the key; better given as ADVTEX_API_KEY")]
 Seconds = Annotated[float | None, typer.Option("--timeout", min=0, help="stop waiting after this many seconds")]
+Only = Annotated[
+    str | None,
+    typer.Option(metavar="WORDS", help="fetch only these files: names, kinds or endings, for example usdz,mobile"),
+]
 Folder = Annotated[Path | None, typer.Option("-o", "--output", help="fetch the results into this folder")]
 PriorityOption = Annotated[int, typer.Option("--priority", min=-100, max=100, help="larger runs earlier")]
 KeepOption = Annotated[

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from advtex_client import cli_batch
-from advtex_client._calls import ensure_succeeded
+from advtex_client._calls import ensure_succeeded, only_results
 from advtex_client._cli import (
     EXIT_CODES,
     ApiKey,
@@ -20,6 +20,7 @@ from advtex_client._cli import (
     Folder,
     JobId,
     KeepOption,
+    Only,
     PriorityOption,
     ScanPath,
     Seconds,
@@ -91,6 +92,7 @@ def submit(
     new: Annotated[bool, typer.Option("--new", help="make another job even if this scan was submitted before")] = False,
     wait: Annotated[bool, typer.Option("--wait", help="follow the job until it ends")] = False,
     output: Folder = None,
+    only: Only = None,
     timeout: Seconds = None,
     url: Url = None,
     api_key: ApiKey = None,
@@ -124,7 +126,7 @@ def submit(
                 display.data(job, job.id)
                 return
             display.note(f"job {job.id}")
-            _finish(client, display, job, output, timeout)
+            _finish(client, display, job, output, timeout, only)
 
 
 @app.command()
@@ -139,6 +141,7 @@ def status(job: JobId, url: Url = None, api_key: ApiKey = None, as_json: AsJson 
 def watch(
     job: JobId,
     output: Folder = None,
+    only: Only = None,
     timeout: Seconds = None,
     url: Url = None,
     api_key: ApiKey = None,
@@ -146,7 +149,7 @@ def watch(
 ) -> None:
     """Follow a job until it ends; with --json, one line per change."""
     with command(as_json) as display, Client(url, api_key) as client:
-        _finish(client, display, client.get_job(job), output, timeout, every_change=as_json)
+        _finish(client, display, client.get_job(job), output, timeout, only, every_change=as_json)
 
 
 @app.command("list")
@@ -187,13 +190,16 @@ def download(
     job: JobId,
     output: Annotated[Path, typer.Option("-o", "--output", help="the folder to fetch into")] = Path(),
     name: Annotated[list[str] | None, typer.Option(help="only this file; may be given several times")] = None,
+    only: Only = None,
     url: Url = None,
     api_key: ApiKey = None,
     as_json: AsJson = False,
 ) -> None:
     """Fetch a job's results; run again, it goes on where it stopped."""
     with command(as_json) as display, Client(url, api_key) as client:
-        paths = _download(client, display, client.get_job(job), output, name)
+        view = client.get_job(job)
+        names = [*(name or []), *(only_results(view, only) if only is not None else [])]
+        paths = _download(client, display, view, output, list(dict.fromkeys(names)))
         display.data([str(path) for path in paths], _lines(paths))
 
 
@@ -238,6 +244,7 @@ def _finish(
     job: JobView,
     output: Path | None,
     timeout: float | None,
+    only: str | None,
     every_change: bool = False,
 ) -> None:
     """Follow `job` to its end, then fetch its results or print it."""
@@ -250,7 +257,7 @@ def _finish(
             last = view
     _ended_well(display, last, told=every_change)
     if output is not None:
-        paths = _download(client, display, last, output, None)
+        paths = _download(client, display, last, output, None if only is None else only_results(last, only))
         display.data({"job": last.model_dump(mode="json"), "files": [str(path) for path in paths]}, _lines(paths))
     elif not every_change:
         display.data(last, last.id)

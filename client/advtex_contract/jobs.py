@@ -170,13 +170,19 @@ class Progress(BaseModel):
 
 
 class ResultFile(BaseModel):
-    """A file of a finished job, downloadable at `url` (path on the same server) with Range requests."""
+    """A file of a finished job, downloadable at `url` (path on the same server) with Range requests.
+
+    kind: the word by which the option `outputs` has it, or "seen", "report", "page" or "previews". purpose: what it is
+    for, in a phrase. Both are empty where they are not known.
+    """
 
     name: str
     size: int
     sha256: str
     content_type: str
     url: str
+    kind: str = ""
+    purpose: str = ""
 
 
 class JobError(BaseModel):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self, get_type_hints
@@ -83,6 +84,9 @@ def _described_fields() -> dict[str, Any]:
         longest = (200 if about.form else 40) if kind in (str, str | None) else None
         offer = partial(_offer, about.choices) if kind is str and about.choices is not None else None
         told: dict[str, Any] = {"description": words, "json_schema_extra": offer}
+        if about.several and about.choices is not None:
+            word = "|".join(map(re.escape, about.choices))
+            longest, told["pattern"] = 200, f"^({word})(,({word}))*$"
         field = Field(default=default, ge=about.low, le=about.high, max_length=longest, **told)
         made[name] = (kind, field)
     return made

@@ -17,6 +17,7 @@ from typing import Any, TypeVar, get_type_hints
 
 from advtex_options.box import FORM, parse_box
 from advtex_options.methods import METHOD_HELP
+from advtex_options.outputs import OUTPUTS
 from advtex_options.words import PRESET_HELP, Preset
 from advtex_scan.layouts import LAYOUT_NAMES
 
@@ -41,6 +42,7 @@ class Described:
     of what. choices: the words that it may be, with their help where they have one; `others` says how there come to be
     more. unset: what happens without it.
     form: of a text, what it looks like; `parse` reads it, and raises ValueError, in a sentence, for what it is not.
+    more, `several` that more than one may be given, with commas between. unset: what happens without it.
     offers: values among which the page lets choose, with what it calls them; `offered` is chosen there to begin with.
     """
 
@@ -52,6 +54,7 @@ class Described:
     unit: str = ""
     choices: Mapping[str, str] | None = None
     others: str = ""
+    several: bool = False
     offers: tuple[tuple[str, str], ...] = ()
     offered: str = ""
     form: str = ""
@@ -163,6 +166,15 @@ class Options:
         form=FORM,
         parse=parse_box,
     )
+    outputs: str | None = option(
+        None,
+        "which files are made beside OBJ, GLB, report and previews, with commas between",
+        "Files",
+        unset="all of them",
+        choices=MappingProxyType({word: output.purpose for word, output in OUTPUTS.items()}),
+        several=True,
+        offers=(("", "the usual, for phones and AR too"), ("glb", "OBJ and GLB only")),
+    )
 
 
 SIZE = Described(
@@ -201,7 +213,8 @@ def refusal(name: str, value: object) -> str | None:
     unset = f", or leave it out ({about.unset})" + (f", or {about.others}" if about.others else "")
     shown = "x".join(map(str, value)) if isinstance(value, tuple) else repr(value)[:60]
     if about.choices is not None:
-        known = isinstance(value, str) and value in about.choices
+        words = value.split(",") if isinstance(value, str) and about.several else [value]
+        known = all(isinstance(word, str) and word in about.choices for word in words)
         return None if known else f"{name} {shown} is unknown; choose one of {', '.join(about.choices)}{unset}"
     if about.parse is not None:
         try:

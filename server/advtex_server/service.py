@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
+from typing import Any
 from urllib.parse import quote
 
 import structlog
@@ -26,6 +27,7 @@ from advtex_contract.jobs import (
 from advtex_contract.live import LiveImage, LiveRecord, LiveView
 from advtex_contract.stored_options import read_options
 from advtex_options import refusal
+from advtex_options.outputs import kind_and_purpose
 from advtex_server.batches import BatchService
 from advtex_server.older_clients import told
 from advtex_server.refusal import ApiError
@@ -215,16 +217,6 @@ class Service:
 def job_view(row: JobRow) -> JobView:
     """The row as the API shows it."""
     state = row.state
-    results = [
-        ResultFile(
-            name=f["name"],
-            size=f["size"],
-            sha256=f["sha256"],
-            content_type=f["content_type"],
-            url=f"/v1/jobs/{row.id}/results/{quote(f['name'])}",
-        )
-        for f in row.results
-    ]
     return JobView(
         id=row.id,
         state=state,
@@ -240,7 +232,7 @@ def job_view(row: JobRow) -> JobView:
         progress=Progress.model_validate(row.progress),
         warnings=[ErrorDetail.model_validate(w) for w in row.warnings],
         error=JobError.model_validate(row.error) if row.error else None,
-        results=results,
+        results=[_result_file(row.id, stored) for stored in row.results],
         created_at=_time(row.created_at),
         updated_at=_time(row.updated_at),
         finished_at=_time(row.finished_at) if row.finished_at else None,
@@ -248,6 +240,19 @@ def job_view(row: JobRow) -> JobView:
         expires_at=_time(row.expires_at) if row.expires_at else None,
         deadline=_time(row.deadline) if row.deadline is not None else None,
         late=row.deadline is not None and (row.finished_at or time.time()) > row.deadline,
+    )
+
+
+def _result_file(job_id: str, stored: Mapping[str, Any]) -> ResultFile:
+    kind, purpose = kind_and_purpose(stored["name"])
+    return ResultFile(
+        name=stored["name"],
+        size=stored["size"],
+        sha256=stored["sha256"],
+        content_type=stored["content_type"],
+        url=f"/v1/jobs/{job_id}/results/{quote(stored['name'])}",
+        kind=kind,
+        purpose=purpose,
     )
 
 

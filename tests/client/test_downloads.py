@@ -13,8 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from advtex_client import Client, ClientError, IntegrityError, NetworkError
+from advtex_client._calls import only_results
 from advtex_client.downloads import target_path
-from advtex_contract.jobs import JobView
+from advtex_contract.jobs import JobState, JobView, ResultFile
 
 DATA = b"0123456789" * 1000
 
@@ -183,3 +184,35 @@ def test_an_empty_result_is_a_file_too(server: FakeServer, client: Client, tmp_p
     job = server.finish("j0", {"empty.txt": b""})
     (path,) = client.download_results(job, tmp_path)
     assert path.read_bytes() == b""
+
+
+def named(*names: str) -> JobView:
+    files = [ResultFile(name=name, size=1, sha256="0" * 64, content_type="x", url="/") for name in names]
+    return view("j0", JobState.succeeded).model_copy(update={"results": files})
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("mobile", ["model_mobile.glb"]),
+        ("glb,usdz", ["model.glb", "model.usdz"]),
+        ("model.mtl, mobile", ["model.mtl", "model_mobile.glb"]),
+        ("obj", ["model.obj", "model.mtl", "model.png"]),
+        ("previews", ["previews/0.jpg"]),
+        ("json", ["report.json"]),
+    ],
+)
+def test_files_are_chosen_by_name_kind_and_ending(words: str, found: list[str]) -> None:
+    names = ("model.obj", "model.mtl", "model.png", "model.glb", "model_mobile.glb", "model.usdz")
+    assert only_results(named(*names, "previews/0.jpg", "report.json"), words) == found
+
+
+def test_a_word_that_no_file_answers_to_is_said_with_those_that_there_are() -> None:
+    with pytest.raises(ClientError, match=r"no result 'fbx'; give a file's name, its ending, or one of obj, mobile"):
+        only_results(named("model.obj", "model_mobile.glb"), "mobile,fbx")
+
+
+def test_the_kind_that_the_server_tells_counts() -> None:
+    job = named("later.bin")
+    job.results[0].kind = "splats"
+    assert only_results(job, "splats") == ["later.bin"]

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel, ValidationError
 
 from advtex_contract import errors, health, jobs, live, options, stored_options, webhooks
+from advtex_options.outputs import OUTPUTS, wanted
 
 SENT = {jobs.BatchLimits, jobs.JobSpec, options.JobOptions, webhooks.WebhookSpec}
 MODELS = sorted(
@@ -96,3 +97,24 @@ def test_an_option_that_only_another_version_knows_does_no_harm_until_it_is_give
 def test_options_that_are_sent_are_refused_where_they_are_not_known() -> None:
     with pytest.raises(ValidationError, match="from_the_future"):
         jobs.JobSpec.model_validate({"upload_id": "u", "options": {"from_the_future": 1}})
+
+
+def test_which_files_are_made_is_a_list_of_known_words() -> None:
+    assert options.chosen_options({"outputs": "usdz,mobile"}).outputs == "usdz,mobile"
+    for wrong in ("fbx", "usdz,fbx", "usdz, mobile", ""):
+        with pytest.raises(ValueError, match=r"outputs .* is unknown; choose one of obj, glb, usdz, mobile, lod"):
+            options.chosen_options({"outputs": wrong})
+        with pytest.raises(ValidationError, match="choose one of obj"):
+            jobs.JobSpec.model_validate({"upload_id": "u", "options": {"outputs": wrong}})
+
+
+def test_what_a_file_is_for_may_be_untold() -> None:
+    least = {"name": "model.glb", "size": 1, "sha256": "0" * 64, "content_type": "x", "url": "/"}
+    assert jobs.ResultFile.model_validate(least).purpose == ""
+    assert jobs.ResultFile.model_validate(least | {"kind": "glb", "from_the_future": 1}).kind == "glb"
+
+
+def test_what_was_not_asked_for_is_left_out_but_for_what_is_always_made() -> None:
+    assert wanted(None) == set(OUTPUTS)
+    assert wanted("mobile") == {"obj", "glb", "mobile"}
+    assert wanted("glb") == {"obj", "glb"}

@@ -99,6 +99,9 @@ def test_a_run_leaves_models_previews_and_a_report(whole: tuple[Path, Recorder])
         "model.glb",
         "model.usdz",
         "model_seen.png",
+        "model_mobile.glb",
+        "model_lod1.glb",
+        "model_lod2.glb",
         "previews/comparison.png",
         "previews/sheet.png",
     ):

@@ -247,6 +247,8 @@ def test_a_result(live: Any, result: tuple[str, bytes], is_error: Any) -> None:
         "size": len(data),
         "sha256": sha256,
         "content_type": "model/gltf-binary",
+        "kind": "glb",
+        "purpose": "for viewers and game engines: all faces and texels in one file",
         "url": url,
     }
     response = live.http.get(url)

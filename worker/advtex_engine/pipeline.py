@@ -30,6 +30,7 @@ from advtex_engine.results import (
     write_page,
     write_report,
     write_seen,
+    write_smaller,
 )
 from advtex_engine.runtime import Stages, WorkFolder, choose_device
 from advtex_engine.stages import (
@@ -43,6 +44,7 @@ from advtex_engine.stages import (
     refined_scene,
 )
 from advtex_options.box import parse_box
+from advtex_options.outputs import wanted
 
 
 @dataclass(frozen=True)
@@ -99,8 +101,12 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
         atlas, completed = completed_model(atlas, texture, seen, made["mesh"]["made_up_faces"], config)
     texture = completed.texture
     with stages.run("export"):
-        files = export_model(out, atlas, texture, up_axis=scene.up_axis, lossless=config.lossless, usdz=True)
+        outputs = wanted(config.outputs)
+        files = export_model(
+            out, atlas, texture, up_axis=scene.up_axis, lossless=config.lossless, usdz="usdz" in outputs
+        )
         files += write_seen(out, atlas, completed.state)
+        files += write_smaller(out, atlas, texture, outputs, up_axis=scene.up_axis)
     with stages.run("previews"):
         files += write_gallery(out, scene, atlas, texture, mean, curves(losses, given.live.quality), completed.state)
         atlas = replace(atlas, mesh=atlas.mesh.to(torch.device("cpu")))

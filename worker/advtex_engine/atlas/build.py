@@ -69,7 +69,7 @@ def build_atlas(
                 "none needed; upload a mesh whose uv do not overlap to keep them",
             )
         )
-    return _new_atlas(mesh, wanted, config, monitor, make_charts if charts is None else charts.make)
+    return new_atlas(mesh, wanted, _cap(config), monitor, make_charts if charts is None else charts.make)
 
 
 def begin_charts(mesh: Mesh, charts: ChartMaker) -> None:
@@ -138,10 +138,13 @@ def _count_islands(t_uv_idx: Integers) -> int:
 # New charts -----------------------------------------------------------------------------------------------------------
 
 
-def _new_atlas(mesh: Mesh, wanted: Floats, config: TextureConfig, monitor: Monitor, make: ChartFunction) -> Atlas:
+def new_atlas(mesh: Mesh, wanted: Floats, cap: int, monitor: Monitor, make: ChartFunction = make_charts) -> Atlas:
+    """An atlas of new charts of a cleaned mesh. wanted: [T] texels of each face; all get fewer where the texture's side
+    would be more than `cap`, a multiple of SIZE_STEP.
+    """
     charts = make(_at_xatlas_scale(mesh), mesh.t_pos_idx.numpy(), monitor)
     charts = replace(charts, uv=_scale_charts(charts, wanted))
-    pages, cap = 1, _cap(config)
+    pages = 1
     for _ in range(PACKING_ROUNDS):
         texel, page, side = _lay_out(charts, pages, monitor)
         if side > MAX_PAGE and pages < PAGES and cap > MAX_PAGE:

@@ -2,6 +2,7 @@
 
 from advtex_engine.results.export import export_model
 from advtex_engine.results.gallery import write_gallery
+from advtex_engine.results.levels import write_smaller
 from advtex_engine.results.report import assembled, describe_scene, heldout_scores, write_report
 from advtex_engine.results.result_page import write_page
 from advtex_engine.results.seen import write_seen
@@ -15,4 +16,5 @@ __all__ = [
     "write_page",
     "write_report",
     "write_seen",
+    "write_smaller",
 ]

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from advtex_engine.core.scene import TO_Y_UP, Atlas
 from advtex_engine.mesh.normals import vertex_normals
-from advtex_engine.results.images import encode_png, encode_texture
+from advtex_engine.results.images import JPEG_QUALITY, encode_png, encode_texture
 from advtex_engine.results.pages import Array, Page, on_cpu, split_at_seams, split_pages
 from advtex_engine.results.usdz import write_usdz
 from advtex_engine.runtime.files import atomic_file, write_atomically
@@ -65,6 +65,11 @@ def export_model(
     return obj, mtl, *images, glb, *([package] if usdz else ())
 
 
+def write_glb(path: Path, atlas: Atlas, texture: Tensor, *, up_axis: str, quality: int = JPEG_QUALITY) -> None:
+    """The GLB alone, its images JPEGs; `export_model` describes the rest."""
+    _write_glb(path, split_pages(atlas, texture), vertex_normals(on_cpu(atlas.mesh)), up_axis, False, quality)
+
+
 # OBJ
 
 
@@ -101,7 +106,14 @@ def _write_lines(file: BinaryIO, line: str, rows: Tensor) -> None:
 # GLB
 
 
-def _write_glb(path: Path, pages: Sequence[Page], normals: Tensor, up_axis: str, lossless: bool) -> None:
+def _write_glb(
+    path: Path,
+    pages: Sequence[Page],
+    normals: Tensor,
+    up_axis: str,
+    lossless: bool,
+    quality: int = JPEG_QUALITY,
+) -> None:
     """glTF 2.0 binary: a header, a JSON chunk and a binary chunk, each padded to four bytes."""
     document = _gltf(up_axis)
     chunks, offset = list[bytes](), 0
@@ -119,7 +131,7 @@ def _write_glb(path: Path, pages: Sequence[Page], normals: Tensor, up_axis: str,
         targets = (GLTF_ELEMENT_ARRAY_BUFFER, GLTF_ARRAY_BUFFER, GLTF_ARRAY_BUFFER, GLTF_ARRAY_BUFFER)
         views = [add_view(array.tobytes(), target) for array, target in zip(arrays, targets, strict=True)]
         _add_page(document, page, arrays, views)
-        image = encode_texture(page.image, lossless=lossless)
+        image = encode_texture(page.image, lossless=lossless, quality=quality)
         view = {"bufferView": add_view(image.data, None), "mimeType": image.media_type}
         document["images"].append({"name": f"texture{page.suffix}", **view})
     document["buffers"] = [{"byteLength": offset}]

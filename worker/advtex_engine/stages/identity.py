@@ -12,7 +12,7 @@ from advtex_engine.ingest.read import opened
 from advtex_engine.runtime.checkpoint import FORMAT
 
 # Options on which nothing that is kept depends: neither the texture, nor what it is made of.
-NO_RESULT = ("device", "checkpoint_seconds", "memory_bytes", "lossless", "unseen")
+NO_RESULT = ("device", "checkpoint_seconds", "memory_bytes", "lossless", "unseen", "outputs")
 
 
 def fingerprint(scan: Path, config: TextureConfig) -> str:

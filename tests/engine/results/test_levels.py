@@ -104,6 +104,12 @@ def test_a_model_that_is_small_already_keeps_its_faces_and_texels(tmp_path: Path
     assert texture.shape == full.texture.shape
 
 
+def test_few_faces_stay_as_they_are_in_all_levels(tmp_path: Path) -> None:
+    full = many_charts(8, 64)
+    for path in write_smaller(tmp_path, full.atlas, full.texture, {"lod"}, up_axis="+y"):
+        assert len(load_model(path)[0].mesh.t_pos_idx) == full.faces
+
+
 def test_khronos_validator_finds_nothing(tmp_path: Path, gltf_report: Callable[[Path], dict[str, Any]]) -> None:
     full = many_charts()
     files = write_smaller(tmp_path, full.atlas, full.texture, {"mobile", "lod"}, up_axis="+z")

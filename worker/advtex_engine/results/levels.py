@@ -17,6 +17,7 @@ SMALL_SIDE, SHRINKING = 2048, 1.3
 """The image has SMALL_SIDE texels a side where the texture is at most SHRINKING times as large: a kitchen's renders of
 1.22 times are .003 LPIPS farther from the full model's by it, and 1.5 times would cost over .01."""
 LEVELS, QUARTER = 2, 4
+LEAST_FACES = 200  # no level has fewer: they cost nothing, and a coarse mesh would collapse to nothing
 QUALITIES = (95, 90, 85, 80, 70, 60, 50)
 """Of JPEGs, tried until a file is small enough."""
 
@@ -38,7 +39,7 @@ def write_smaller(
     if "lod" in outputs:
         level = full
         for number in range(1, LEVELS + 1):
-            level = smaller(level, level.faces // QUARTER, 1 / QUARTER, MOBILE_SIDE, Monitor()).model
+            level = smaller(level, max(level.faces // QUARTER, LEAST_FACES), 1 / QUARTER, MOBILE_SIDE, Monitor()).model
             files.append(out / f"{name}_lod{number}.glb")
             write_glb(files[-1], level.atlas, level.texture, up_axis=up_axis)
     return tuple(files)

@@ -54,8 +54,7 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same scan as a zip, made a second time, the object too."""
-    synthetic_object.build.cache_clear()
+    """The same scan as a zip, made a second time."""
     out = tmp_path_factory.mktemp("synthetic") / "new" / "scan.zip"
     synthesize(out, views=VIEWS, width=WIDTH, height=HEIGHT)
     return out

@@ -68,7 +68,7 @@ def distributed(tmp_path: Path, postgres_url: str, s3_url: str) -> Place:
 def earlier_fleet(folder: Path, place: Place, earlier: Release, engine: str) -> Iterator[Fleet]:
     """One server and one worker of the earlier release, on its own schema; there is room for as many of the present."""
     with ExitStack() as stack:
-        running = Fleet(folder, place, stack, servers=2, workers=2, engine=engine, variables={})
+        running = Fleet(folder, place, stack, servers=2, workers=2, engine=engine, variables={}, dispatch=True)
         try:
             running.start_redis()
             migrate_database(running.settings.database, earlier.newest_schema)

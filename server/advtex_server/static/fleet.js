@@ -84,14 +84,14 @@ function day(fleet) {
   for (const { states } of fleet.hours) for (const [state, jobs] of Object.entries(states)) ended[state] = (ended[state] ?? 0) + jobs;
   if (!total(ended)) return [hint("Nothing has ended.")];
   const told = Object.entries(ended).map(([state, jobs]) => `${count(jobs)} ${state}`).join(", ");
-  const bars = el("ol", { class: "hours", role: "img", "aria-label": `Jobs that ended, by hour: ${told}` },
+  const bars = el("div", { class: "hours", role: "img", "aria-label": `Jobs that ended, by hour: ${told}` },
     fleet.hours.map((hour) => {
       const parts = Object.entries(hour.states).map(([state, jobs]) => {
         const part = el("span", { class: tone(state) });
         part.style.height = `${(100 * jobs) / most}%`;
         return part;
       });
-      return el("li", { title: `${clock(hour.begins)}: ${count(total(hour.states))}` }, parts);
+      return el("div", { title: `${clock(hour.begins)}: ${count(total(hour.states))}` }, parts);
     }));
   return [el("p", {}, told), bars, el("p", { class: "ends hint" },
     el("span", {}, clock(fleet.hours[0].begins)), el("span", {}, `at most ${count(most)} an hour`), el("span", {}, "now"))];

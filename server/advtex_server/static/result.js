@@ -52,7 +52,7 @@ export async function showResult(job) {
 
 function showDownloads(results) {
   const line = (file) => el("li", {},
-    el("div", {}, el("a", { href: file.url, download: "" }, file.name), el("small", {}, FILES[file.name] ?? "")),
+    el("div", {}, el("a", { href: file.url, download: "" }, file.name), el("small", {}, FILES[file.name] ?? file.purpose ?? "")),
     el("span", { class: "num" }, bytes(file.size)));
   const pictures = results.filter((file) => file.name.startsWith("previews/"));
   const models = results.filter((file) => !pictures.includes(file));

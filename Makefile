@@ -29,7 +29,9 @@ test: install
 	$(RUFF) format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal  # one thread each: threads of two processes wait for each other
+	# Three processes for two cores, since tests of services wait a lot; one thread each, since threads of two processes
+	# wait for each other.
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist worksteal
 
 demo: install
 	@.ci/demo $(if $(SCAN),'$(SCAN)')

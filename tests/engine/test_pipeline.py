@@ -173,9 +173,10 @@ def test_a_stopped_run_resumes_to_the_same_bytes_without_redoing_earlier_stages(
 
 
 def test_without_resume_and_with_other_options_the_work_folder_is_not_used(scan: Path, tmp_path: Path) -> None:
+    config = replace(CONFIG, refine=False)
     with pytest.raises(Stopped):
-        texture_scan(scan, tmp_path, CONFIG, work=tmp_path / "work", monitor=Recorder(stop_at=5))
-    other = TextureConfig(preset="standard", steps=STEPS, holdout=6, face_budget=3000, device="cpu")
+        texture_scan(scan, tmp_path, config, work=tmp_path / "work", monitor=Recorder(stop_at=5))
+    other = replace(config, face_budget=3000)
     recorder = Recorder(stop_at=1)
     with pytest.raises(Stopped, match="step 1 of"):
         texture_scan(scan, tmp_path, other, work=tmp_path / "work", resume=True, monitor=recorder)
@@ -184,14 +185,14 @@ def test_without_resume_and_with_other_options_the_work_folder_is_not_used(scan:
 
 @pytest.mark.slow
 def test_a_killed_run_resumes_bit_identical(scan: Path, tmp_path: Path) -> None:
-    arguments = [sys.executable, "-m", "advtex_engine", "texture", str(scan), "--preset", "standard", "--steps", "80"]
-    arguments += ["--face-budget", "4000", "--device", "cpu"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "2"}
-    subprocess.run([*arguments, "-o", str(tmp_path / "whole")], check=True, env=environment, capture_output=True)
+    config = TextureConfig(preset="standard", steps=80, face_budget=4000, device="cpu", refine=False)
+    texture_scan(scan, tmp_path / "whole", config, work=tmp_path / "whole" / "work")
     killed = tmp_path / "killed"
+    options = ["--preset", "standard", "--steps", "80", "--face-budget", "4000", "--device", "cpu", "--no-refine"]
+    options += ["--checkpoint-seconds", "0.2"]
     child = subprocess.Popen(
-        [*arguments, "-o", str(killed), "--checkpoint-seconds", "0.2"],
-        env=environment,
+        [sys.executable, "-m", "advtex_engine", "texture", str(scan), *options, "-o", str(killed)],
+        env={**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads())},
         stderr=subprocess.PIPE,
         text=True,
     )
@@ -203,11 +204,19 @@ def test_a_killed_run_resumes_bit_identical(scan: Path, tmp_path: Path) -> None:
     assert child.wait() == -signal.SIGKILL
     child.stderr.close()
     assert not (killed / "model.obj").exists()
-    second = subprocess.run(
-        [*arguments, "-o", str(killed), "--resume"], check=True, env=environment, capture_output=True, text=True
-    )
-    assert "step 1/" not in second.stderr
+    resumed = Resumed()
+    texture_scan(scan, killed, config, work=killed / "work", resume=True, monitor=resumed)
+    assert resumed.first_step > 1
     assert filecmp.cmp(killed / "model.png", tmp_path / "whole" / "model.png", shallow=False)
+
+
+class Resumed(Monitor):
+    """Remembers where it began."""
+
+    first_step = 0
+
+    def progress(self, step: int, steps: int, losses: Mapping[str, float]) -> None:
+        self.first_step = self.first_step or step
 
 
 @pytest.mark.slow
@@ -223,7 +232,7 @@ def test_a_terminated_run_leaves_a_checkpoint_and_its_exit_code_says_so(scan: Pa
         "--preset",
         "standard",
     ]
-    child = subprocess.Popen([*arguments, "--face-budget", "4000"], stderr=subprocess.PIPE, text=True)
+    child = subprocess.Popen([*arguments, "--face-budget", "4000", "--no-refine"], stderr=subprocess.PIPE, text=True)
     assert child.stderr is not None
     for line in child.stderr:
         if "step " in line:
@@ -240,7 +249,7 @@ def test_a_terminated_run_leaves_a_checkpoint_and_its_exit_code_says_so(scan: Pa
 @pytest.mark.slow
 def test_saving_takes_little_of_a_small_run(scan: Path, tmp_path: Path) -> None:
     """Checkpoints come as often as their share of the time lets them: nothing else bounds them here."""
-    config = TextureConfig(preset="preview", steps=600, face_budget=4000, device="cpu", checkpoint_seconds=0.01)
+    config = replace(PYRAMID, steps=600, checkpoint_seconds=0.01, refine=True)
     recorder = Checkpointed()
     report = texture_scan(scan, tmp_path, config, work=tmp_path / "work", monitor=recorder).report
     assert recorder.checkpoints > 0
@@ -324,7 +333,7 @@ def test_a_resumed_run_keeps_the_warnings_of_stages_that_it_takes_over(tmp_path:
     assert again.warnings[0]["remedy"] == "look at it"
 
 
-PYRAMID = TextureConfig(preset="preview", steps=STEPS, face_budget=4000, device="cpu")
+PYRAMID = TextureConfig(preset="preview", steps=STEPS, face_budget=4000, device="cpu", refine=False, outputs="glb")
 
 
 @pytest.fixture(scope="module")
@@ -355,7 +364,7 @@ def test_a_pyramid_that_is_stopped_at_either_level_resumes_to_the_same_bytes(
 
 
 def test_the_mean_method_takes_no_steps(scan: Path, tmp_path: Path) -> None:
-    config = TextureConfig(method="mean", face_budget=4000, device="cpu")
+    config = TextureConfig(method="mean", face_budget=4000, device="cpu", refine=False, outputs="glb")
     result = texture_scan(scan, tmp_path, config, work=tmp_path / "work", monitor=Recorder())
     assert result.report["losses"] == []
     assert (tmp_path / "model.glb").exists()

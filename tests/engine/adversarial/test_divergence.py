@@ -21,7 +21,9 @@ from advtex_engine.runtime.files import json_text
 from advtex_engine.synthetic.scan import synthesize
 
 STEPS, POISONED = 12, 8
-CONFIG = TextureConfig(preset="standard", steps=STEPS, face_budget=800, max_texture_size=256, device="cpu")
+CONFIG = TextureConfig(
+    preset="standard", steps=STEPS, face_budget=800, max_texture_size=256, device="cpu", refine=False
+)
 
 
 @pytest.fixture(scope="module")

@@ -29,6 +29,7 @@ from advtex_contract.stored_options import read_options
 from advtex_options import refusal
 from advtex_options.outputs import kind_and_purpose
 from advtex_server.batches import BatchService
+from advtex_server.loops import Loop
 from advtex_server.older_clients import told
 from advtex_server.refusal import ApiError
 from advtex_server.settings import ServerSettings
@@ -50,7 +51,10 @@ log = structlog.get_logger("advtex.server")
 
 
 class Service:
-    """What a caller can do. `wake` is called when there is a scan to check, or a job for the workers."""
+    """What a caller can do. `wake` is called when there is a scan to check, or a job for the workers.
+
+    loops: what goes on in the background of the same process.
+    """
 
     def __init__(
         self,
@@ -58,8 +62,10 @@ class Service:
         settings: ServerSettings,
         wake: Callable[[], None] = lambda: None,
         traces: Traces = OFF,
+        loops: Sequence[Loop] = (),
     ) -> None:
         self.store = store
+        self.loops = loops
         self.settings = settings
         self.wake = wake
         self.traces = traces

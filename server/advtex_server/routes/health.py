@@ -29,7 +29,7 @@ async def healthz() -> Alive:
 )
 def readyz(service: TheService, response: Response) -> Readiness:
     """Whether work can be accepted, with one sentence per part that does not work."""
-    found = checks(service.store, service.settings)
+    found = checks(service.store, service.settings, service.loops)
     ready = all(check.ok or not check.essential for check in found)
     response.status_code = 200 if ready else 503
     parts = {c.name: PartView(ok=c.ok, essential=c.essential, message=c.message) for c in found}

@@ -184,7 +184,7 @@ def test_a_sigterm_to_the_runner_alone_is_a_preemption_too(store: Store, host: H
 def test_a_storage_that_fails_for_a_while_delays_the_results(
     store: Store, host: Hosts, new_job: NewJob, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("advtex_worker.attempt.RETRY_SECONDS", 0.0)
+    monkeypatch.setattr("advtex_worker.patience.RETRY_SECONDS", 0.0)
     commit, troubles = Results.commit, iter([NoSpace("the disk is full"), BlobsUnavailable("no answer")])
 
     def flaky(*arguments: Any) -> Any:
@@ -211,7 +211,7 @@ REFUSALS = [
 def test_a_refusal_that_stays_ends_the_job_with_its_reason_after_a_while(
     store: Store, settings: WorkerSettings, new_job: NewJob, monkeypatch: pytest.MonkeyPatch, refusal: Exception
 ) -> None:
-    monkeypatch.setattr("advtex_worker.attempt.RETRY_SECONDS", 0.5)
+    monkeypatch.setattr("advtex_worker.patience.RETRY_SECONDS", 0.5)
 
     def refused(*_: Any) -> None:
         raise refusal
@@ -240,7 +240,7 @@ def test_an_outage_and_a_refusal_that_is_mended_cost_nothing(
     store: Store, settings: WorkerSettings, new_job: NewJob, monkeypatch: pytest.MonkeyPatch, trouble: Exception
 ) -> None:
     """Outages may last longer than refusals."""
-    monkeypatch.setattr("advtex_worker.attempt.RETRY_SECONDS", 0.5)
+    monkeypatch.setattr("advtex_worker.patience.RETRY_SECONDS", 0.5)
     fetch, began = Attempt._fetch_scan, time.monotonic()
 
     def troubled(self: Attempt) -> None:

@@ -13,6 +13,7 @@ from contextlib import suppress
 
 import structlog
 from redis import RedisError
+from sqlalchemy.exc import SQLAlchemyError
 from starlette.concurrency import run_in_threadpool
 
 from advtex_contract.jobs import JobState
@@ -232,6 +233,9 @@ class Dispatcher:
         for job_id, attempt in self.store.records.expired():
             with self.store.troubles.of(ADOPT, job_id):
                 self._give_up(job_id, attempt)
+        for job_id, attempt in self.store.records.expired(aside=True):
+            with self.store.troubles.of(ADOPT, job_id):
+                self._end_unread(job_id, attempt)
 
     def _adopt_waiting(self) -> None:
         aside = self.store.troubles.aside(ADOPT)
@@ -266,3 +270,15 @@ class Dispatcher:
                     "lost", self.store.records.job(job_id).traceparent, job=job_id, attempt=attempt
                 )
                 lost.end("its worker died or cannot be reached", state=state)
+
+    def _end_unread(self, job_id: str, attempt: int) -> None:
+        """Nobody has it, and for many rounds nobody could read whether it has finished: it would run for ever."""
+        try:
+            self._give_up(job_id, attempt)
+        except SQLAlchemyError:
+            raise
+        except Exception as error:
+            self.store.blobs.check()  # a storage that is away as a whole is no job's own trouble
+            with suppress(StaleAttempt):
+                self.store.results.end_unread(job_id, attempt, error, expired_only=True)
+                log.error("a job has failed, as its results cannot be read", job=job_id, error=str(error))

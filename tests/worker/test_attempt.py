@@ -258,6 +258,22 @@ def test_an_outage_and_a_refusal_that_is_mended_cost_nothing(
     assert (row.state, row.attempt, row.waiting_reason) == (JobState.succeeded, 1, "")
 
 
+@pytest.mark.one_machine("the manifest is a blob like any other")
+def test_a_list_of_results_that_is_damaged_ends_the_job_with_that_reason(
+    store: Store, host: Hosts, new_job: NewJob
+) -> None:
+    """An attempt cannot adopt them, and could not commit its own."""
+    job_id = new_job()
+    store.blobs.put(keys.result_manifest_key(job_id), b'{"attempt": 1}')
+    run_attempt(host("quick"), job_id, 1)
+    row = store.records.job(job_id)
+    assert row.error is not None
+    assert (row.state, row.deaths, row.error["code"]) == (JobState.failed, 0, "results_lost")
+    store.records.retry(job_id)
+    run_attempt(host("quick"), job_id, 2)
+    assert store.records.job(job_id).state == JobState.succeeded
+
+
 def test_a_flaw_of_the_worker_itself_is_a_death_with_its_traceback(
     store: Store, host: Hosts, new_job: NewJob, monkeypatch: pytest.MonkeyPatch
 ) -> None:

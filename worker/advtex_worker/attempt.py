@@ -14,7 +14,7 @@ import structlog
 from advtex_contract.errors import ErrorDetail
 from advtex_contract.jobs import JobError
 from advtex_store import keys
-from advtex_store.errors import BlobNotFound, ReferenceRefused, StaleAttempt
+from advtex_store.errors import BlobNotFound, ReferenceRefused, ResultsUnreadable, StaleAttempt
 from advtex_store.process_ends import how_it_ended
 from advtex_store.records import Claim
 from advtex_store.store import Store
@@ -117,6 +117,9 @@ class Attempt:
                 self._run()
         except Interrupted:
             self._give_back()
+        except ResultsUnreadable as error:
+            damage = error
+            self._patience.record(lambda: self._store.results.end_unread(self._job_id, self._number, damage))
         except Refused as refused:
             error = JobError(code="storage_refused", message=str(refused), log_tail=self._log_tail())
             self._patience.record(lambda: self._store.records.fail(self._job_id, self._number, error))

@@ -18,6 +18,7 @@ from advtex_store.errors import (
     NoSpace,
     ReferenceRefused,
     ReferenceUnreadable,
+    ResultsUnreadable,
     StaleAttempt,
     StoreError,
 )
@@ -128,7 +129,7 @@ def _is_answer(error: Exception) -> bool:
     """Errors that say how things are: no other try would say otherwise."""
     if isinstance(error, ReferenceUnreadable):  # may be mended while the job waits
         return False
-    return isinstance(error, StaleAttempt | BlobNotFound | ReferenceRefused)
+    return isinstance(error, StaleAttempt | BlobNotFound | ReferenceRefused | ResultsUnreadable)
 
 
 def _is_refusal(error: Exception) -> bool:

@@ -20,8 +20,8 @@ from sqlalchemy import CTE, JSON, ColumnElement, Select, TextClause, func, selec
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from advtex_contract.jobs import JobState
-from advtex_store.lines import Allowance, Line, read_holds
-from advtex_store.models import KEPT, WAITS_FOR_ITS_TURN, JobRow
+from advtex_store.lines import Allowance, Line, read_holds, read_running
+from advtex_store.models import WAITS_FOR_ITS_TURN, JobRow
 
 FIRST_DEPTH = 8  # rows that are read of every line at first
 AGING_SECONDS = 3600.0  # of waiting for which a batch that has nothing running counts as one step of priority more
@@ -68,7 +68,7 @@ def next_jobs(
     that is limited.
     """
     holds = read_holds(session, offered)
-    running = _running(session)
+    running = read_running(session)
     use_order_of_index(session)
     depth = FIRST_DEPTH
     while True:
@@ -102,11 +102,6 @@ def use_order_of_index(session: Session) -> None:
     rather sort all that waits than read the first few of an index."""
     if session.get_bind().dialect.name == "postgresql":
         session.execute(text("set local enable_sort = off"))
-
-
-def _running(session: Session) -> Mapping[Line, int]:
-    query = select(JobRow.line, func.count()).where(JobRow.state == JobState.running, KEPT).group_by(JobRow.line)
-    return {Line.of(line): int(count) for line, count in session.execute(query)}
 
 
 def _read_lines(session: Session, depth: int, gib: int | None) -> Mapping[Line, list[Sequence[_Place]]]:

@@ -46,7 +46,7 @@ from advtex_store.accounts import check_active_jobs
 from advtex_store.counters import ATTEMPTS, count_one
 from advtex_store.database import Database
 from advtex_store.errors import IllegalTransition, NotUnderstood, StaleAttempt
-from advtex_store.fair_queue import WaitingJob, distinct_pairs, next_jobs, use_order_of_index
+from advtex_store.fair_queue import Gaze, WaitingJob, distinct_pairs, next_jobs, use_order_of_index
 from advtex_store.lines import read_holds
 from advtex_store.memory_estimate import GIB
 from advtex_store.models import KEPT, WAITS_FOR_A_REASON, EventRow, JobRow
@@ -90,6 +90,7 @@ class Records(Transitions):
     def __init__(self, database: Database, *, lease_seconds: float = 60.0) -> None:
         super().__init__(database)
         self.lease_seconds = lease_seconds
+        self._gaze = Gaze()
 
     # -- worker ---------------------------------------------------------------------------------------------------
 
@@ -252,7 +253,7 @@ class Records(Transitions):
         """
         gib = None if memory_bytes is None else memory_bytes // GIB
         with self.database.read() as session:
-            return next_jobs(session, limit, self.database.now(session), gib, offered)
+            return next_jobs(session, limit, self.database.now(session), gib, offered, self._gaze)
 
     def ready(self, limit: int) -> dict[int, int]:
         """How many of the jobs that wait begin as soon as they have workers, by the GiB that they need; of those that

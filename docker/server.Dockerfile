@@ -7,7 +7,7 @@ WORKDIR /src
 COPY . .
 # botocore describes every service of the cloud; here are the storage and what signs in to it.
 RUN --mount=type=cache,target=/root/.cache/pip \
-    pip --python /opt/advtex/bin/python install --constraint constraints.txt '.[server]' \
+    pip --python /opt/advtex/bin/python install --constraint constraints.txt '.[server,traces]' \
     && find /opt/advtex/lib/python3.12/site-packages/botocore/data -mindepth 1 -maxdepth 1 -type d \
         ! -name s3 ! -name sts ! -name sso ! -name sso-oidc -exec rm -rf {} +
 # What is installed, as CycloneDX: docker run --rm --entrypoint cat advtex-server /opt/advtex/sbom.json

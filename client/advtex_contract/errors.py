@@ -144,7 +144,7 @@ JOB_EXPLANATIONS: Mapping[str, Explanation] = {
         "Ask for a smaller size or fewer views; the job's log tail has what it said last.",
     ),
     "results_lost": Explanation(
-        "The job had succeeded, but its files are gone from the storage.",
+        "The job had succeeded, but its files are gone from the storage, or the list of them is damaged.",
         "Retry the job, or have the operator restore the storage from its backup.",
     ),
 }

@@ -69,7 +69,7 @@ def create_app(settings: ServerSettings, *, dispatch: bool = True) -> FastAPI:
         docs_url=None,  # their pages load scripts from elsewhere
         redoc_url=None,
     )
-    app.state.service = Service(store, settings, wake, traces)
+    app.state.service = Service(store, settings, wake, traces, background.loops if background else ())
     app.state.webhooks = WebhookService(store.webhooks, rules(settings))
     app.state.stopping = asyncio.Event()
     app.state.intake = Intake(store, settings, traces)

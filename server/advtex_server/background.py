@@ -12,6 +12,7 @@ from contextlib import asynccontextmanager, suppress
 from advtex_server.checking import Checker
 from advtex_server.deliveries import Deliverer
 from advtex_server.dispatch import Dispatcher
+from advtex_server.loops import Loop
 from advtex_server.metrics import Metrics
 from advtex_server.settings import ServerSettings
 from advtex_store.store import Store
@@ -25,6 +26,12 @@ class Background:
         self._dispatcher = Dispatcher(store, settings, metrics.round, traces)
         self._checker = Checker(store, settings, self._dispatcher.wake, traces)
         self._deliverer = Deliverer(store.webhooks, settings, metrics.delivered, traces)
+        metrics.watch(self.loops)
+
+    @property
+    def loops(self) -> tuple[Loop, ...]:
+        """All that goes on while it is `running`."""
+        return (*self._dispatcher.loops, *self._checker.loops, self._deliverer.loop)
 
     def wake(self) -> None:
         """From any thread: look now."""

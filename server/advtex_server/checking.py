@@ -23,6 +23,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from advtex_contract.errors import ErrorCode, ErrorDetail
 from advtex_contract.jobs import JobError
 from advtex_server.check_process import LENGTH
+from advtex_server.loops import Loop
 from advtex_server.settings import ServerSettings
 from advtex_store.blobs import FolderBlobs
 from advtex_store.checks import CheckClaim
@@ -70,7 +71,10 @@ class Checker:
         self._wake = wake
         self._news = threading.Event()
         self._stopping = threading.Event()
-        self._threads = [threading.Thread(target=self._work, name=f"check-{n}", daemon=True) for n in range(PROCESSES)]
+        self.loops = tuple(Loop(f"check-{number}") for number in range(PROCESSES))
+        self._threads = [
+            threading.Thread(target=self._work, args=(loop,), name=loop.name, daemon=True) for loop in self.loops
+        ]
 
     def start(self) -> None:
         for thread in self._threads:
@@ -87,24 +91,17 @@ class Checker:
         for thread in self._threads:
             thread.join()
 
-    def _work(self) -> None:
-        """Until the server stops. Nothing that fails ends it: another look follows."""
-        ill = False
+    def _work(self, loop: Loop) -> None:
+        """Until the server stops."""
         while not self._stopping.is_set():
             self._news.clear()
-            try:
+            more = False
+            with loop.turn():
                 claim = self._store.checks.claim()
-                ill = False
                 if claim is not None:
                     self._carry(claim)
-                    continue
-            except (SQLAlchemyError, StoreError, OSError) as error:
-                if not ill:
-                    log.warning("cannot check, jobs wait", error=str(error))
-                ill = True
-            except Exception:
-                log.exception("a check failed")
-            if not self._stopping.is_set():
+                    more = True
+            if not more and not self._stopping.is_set():
                 self._news.wait(self._poll_seconds)
 
     def _carry(self, claim: CheckClaim) -> None:

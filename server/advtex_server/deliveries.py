@@ -15,6 +15,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from standardwebhooks import Webhook
 from starlette.concurrency import run_in_threadpool
 
+from advtex_server.loops import Loop
 from advtex_server.settings import ServerSettings
 from advtex_server.targets import TargetRefused, TargetRules
 from advtex_store.tracing import OFF, Traces
@@ -41,31 +42,38 @@ class Deliverer:
         self._count = count
         self._traces = traces
         self.rules = rules(settings)
+        self.loop = Loop("webhooks")
         self._running: dict[str, asyncio.Task[None]] = {}
+        self._opened: httpx.AsyncClient | None = None
 
     async def run(self) -> None:
         """Until canceled. A try that is cut off then is made again."""
         try:
-            async with self._client() as client:
-                while True:
-                    await self._begin(client)
-                    await asyncio.sleep(LOOK_SECONDS)
+            while True:
+                with self.loop.turn():
+                    await self._begin()
+                await asyncio.sleep(LOOK_SECONDS)
         finally:
             for task in self._running.values():
                 task.cancel()
+            if self._opened is not None:
+                await self._opened.aclose()
 
     def _client(self) -> httpx.AsyncClient:
-        # No proxies from the environment, which would look names up again; no redirects, which lead elsewhere.
-        context = ssl.create_default_context()
-        return httpx.AsyncClient(verify=context, trust_env=False, follow_redirects=False, timeout=ANSWER_SECONDS)
+        """Made by the first turn that can: it reads files of the system."""
+        if self._opened is None:
+            # No proxies from the environment, which would look names up again; no redirects, which lead elsewhere.
+            context = ssl.create_default_context()
+            self._opened = httpx.AsyncClient(
+                verify=context, trust_env=False, follow_redirects=False, timeout=ANSWER_SECONDS
+            )
+        return self._opened
 
-    async def _begin(self, client: httpx.AsyncClient) -> None:
-        try:
-            due = await run_in_threadpool(self.webhooks.take_due, AT_ONCE - len(self._running), set(self._running))
-        except SQLAlchemyError as error:
-            log.warning("webhooks wait for the database", error=str(error))
-            return
-        for delivery in due:
+    async def _begin(self) -> None:
+        client = self._client()
+        for delivery in await run_in_threadpool(
+            self.webhooks.take_due, AT_ONCE - len(self._running), set(self._running)
+        ):
             task = asyncio.create_task(self._attempt(client, delivery))
             self._running[delivery.webhook_id] = task
             task.add_done_callback(partial(self._ended, delivery.webhook_id))
@@ -89,6 +97,8 @@ class Deliverer:
             bound.warning("not delivered", error=error, disabled=disabled)
         except SQLAlchemyError as trouble:
             bound.warning("the outcome is not recorded, it will be sent again", error=str(trouble))
+        except Exception:
+            bound.exception("the outcome is not recorded, it will be sent again")
 
     async def _send(self, client: httpx.AsyncClient, delivery: Delivery, traceparent: str | None) -> tuple[str, bool]:
         """-> what went wrong, if anything, and whether the receiver wants nothing more."""
@@ -118,6 +128,9 @@ class Deliverer:
             return f"the address is refused: {refusal}", False
         except (httpx.HTTPError, OSError, TimeoutError) as error:
             return f"{type(error).__name__}: {error}".rstrip(": "), False
+        except Exception as fault:  # of its address or its secret, most likely: no reason to try it for ever
+            log.exception("a delivery failed", webhook=delivery.webhook_id, delivery=delivery.id)
+            return f"it cannot be sent: the server failed ({type(fault).__name__})", False
         if response.is_success:
             return "", False
         redirected = "; redirects are not followed" if response.is_redirect else ""

@@ -17,8 +17,9 @@ from sqlalchemy.exc import SQLAlchemyError
 from starlette.concurrency import run_in_threadpool
 
 from advtex_contract.jobs import JobState
+from advtex_server.loops import OUTAGES, Loop
 from advtex_server.settings import ServerSettings
-from advtex_store.errors import StaleAttempt, StoreError
+from advtex_store.errors import StaleAttempt
 from advtex_store.fair_queue import WaitingJob
 from advtex_store.queue import WorkerClass, attempt_of, rq_id
 from advtex_store.retention import Retention
@@ -95,9 +96,9 @@ class Dispatcher:
         self.settings = settings
         self._timed = timed
         self.retention = Retention(store.database, store.blobs)
+        self.loops = (Loop("dispatch"), Loop("housekeeping"))
         self._woken = asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._ill = False
         self._next_sweep = 0.0
 
     def wake(self) -> None:
@@ -106,26 +107,18 @@ class Dispatcher:
             self._loop.call_soon_threadsafe(self._woken.set)
 
     async def run(self) -> None:
-        """Until canceled. Nothing that fails ends it: the next round tries again."""
+        """Until canceled."""
         self._loop = asyncio.get_running_loop()
         reconciled = 0.0
+        dispatching, housekeeping = self.loops
         while True:
             self._woken.clear()
-            due = time.monotonic() - reconciled >= self.settings.reconcile_seconds
-            try:
-                if due:
-                    reconciled = time.monotonic()
+            if time.monotonic() - reconciled >= self.settings.reconcile_seconds:
+                reconciled = time.monotonic()
+                with housekeeping.turn():
                     await run_in_threadpool(self._timed, "reconcile", self.reconcile)
+            with dispatching.turn():
                 await run_in_threadpool(self._timed, "dispatch", self.dispatch)
-                if self._ill:
-                    log.info("dispatching again")
-                self._ill = False
-            except (RedisError, SQLAlchemyError, StoreError, OSError) as error:
-                if not self._ill:
-                    log.warning("cannot dispatch, jobs wait", error=str(error))
-                self._ill = True
-            except Exception:
-                log.exception("dispatch failed")
             try:
                 await asyncio.wait_for(self._woken.wait(), self.settings.dispatch_seconds)
             except TimeoutError:
@@ -212,28 +205,57 @@ class Dispatcher:
     def reconcile(self) -> None:
         """Give up expired leases, adopt results that nobody told the rows about, let go what has expired.
 
-        What fails for one job or upload stops no other (`Troubles`).
+        What fails for one job or upload stops no other (`Troubles`), and a fault in one step no other step: the first
+        one is raised in the end. An outage ends the round, as it would every step.
         """
-        troubles = self.store.troubles
+        faults = []
+        for step in (
+            self._give_up_expired,
+            self._adopt_waiting,
+            self.retention.expire,
+            self.retention.purge,
+            self.retention.tidy,
+            self.store.batches.forget,
+            self._drop_old_deliveries,
+            self._sweep,
+            self._clear_spool,
+        ):
+            try:
+                step()
+            except OUTAGES:
+                raise
+            except Exception as fault:
+                faults.append(fault)
+        if faults:
+            raise faults[0]
+
+    def _give_up_expired(self) -> None:
         for job_id, attempt in self.store.records.expired():
-            with troubles.of(ADOPT, job_id):
+            with self.store.troubles.of(ADOPT, job_id):
                 self._give_up(job_id, attempt)
-        aside = troubles.aside(ADOPT)
+        for job_id, attempt in self.store.records.expired(aside=True):
+            with self.store.troubles.of(ADOPT, job_id):
+                self._end_unread(job_id, attempt)
+
+    def _adopt_waiting(self) -> None:
+        aside = self.store.troubles.aside(ADOPT)
         for row in self.store.records.waiting(ADOPT_ROWS):
             if row.attempt > 1 and row.id not in aside:
-                with troubles.of(ADOPT, row.id):
+                with self.store.troubles.of(ADOPT, row.id):
                     if self.store.results.adopt(row.id):
                         log.info("adopted a finished result", job=row.id)
-        self.retention.expire()
-        self.retention.purge()
-        self.retention.tidy()
-        self.store.batches.forget()
+
+    def _drop_old_deliveries(self) -> None:
         if dropped := self.store.webhooks.drop_old():
             log.warning("webhook deliveries given up", count=dropped)
+
+    def _sweep(self) -> None:
         if time.monotonic() >= self._next_sweep:
             self._next_sweep = time.monotonic() + self.settings.sweep_seconds
             if orphans := self.retention.sweep():
                 log.info("orphans removed", count=orphans)
+
+    def _clear_spool(self) -> None:
         self.store.blobs.clear_spool(time.time() - SPOOL_SECONDS)
 
     def _give_up(self, job_id: str, attempt: int) -> None:
@@ -248,3 +270,15 @@ class Dispatcher:
                     "lost", self.store.records.job(job_id).traceparent, job=job_id, attempt=attempt
                 )
                 lost.end("its worker died or cannot be reached", state=state)
+
+    def _end_unread(self, job_id: str, attempt: int) -> None:
+        """Nobody has it, and for many rounds nobody could read whether it has finished: it would run for ever."""
+        try:
+            self._give_up(job_id, attempt)
+        except SQLAlchemyError:
+            raise
+        except Exception as error:
+            self.store.blobs.check()  # a storage that is away as a whole is no job's own trouble
+            with suppress(StaleAttempt):
+                self.store.results.end_unread(job_id, attempt, error, expired_only=True)
+                log.error("a job has failed, as its results cannot be read", job=job_id, error=str(error))

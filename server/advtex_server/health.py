@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from redis import RedisError
 from sqlalchemy import text
 from sqlalchemy.exc import SQLAlchemyError
 
+from advtex_server.loops import Loop
 from advtex_server.settings import ServerSettings
 from advtex_store.errors import SchemaRefused, StoreError
 from advtex_store.schema import Schema
@@ -28,9 +30,11 @@ class Check:
     message: str = ""
 
 
-def checks(store: Store, settings: ServerSettings) -> list[Check]:
-    """Look at database, blobs, disk, queue, workers and what housekeeping could not do."""
-    return [_database(store), _blobs(store), _disk(store, settings), _redis(store), _workers(store), _troubles(store)]
+def checks(store: Store, settings: ServerSettings, loops: Sequence[Loop] = ()) -> list[Check]:
+    """Look at database, blobs, disk, queue, workers, what housekeeping could not do, and what this process does in the
+    background, if it does anything."""
+    found = [_database(store), _blobs(store), _disk(store, settings), _redis(store), _workers(store), _troubles(store)]
+    return [*found, _background(loops)] if loops else found
 
 
 def _database(store: Store) -> Check:
@@ -104,6 +108,11 @@ def _troubles(store: Store) -> Check:
     if len(found) > NAMED_TROUBLES:
         told.append(f"and {len(found) - NAMED_TROUBLES} more")
     return Check("housekeeping", not told, False, "; ".join(told))
+
+
+def _background(loops: Sequence[Loop]) -> Check:
+    told = [loop.trouble for loop in loops if loop.trouble]
+    return Check("background", not told, False, "; ".join(told))
 
 
 def _rounds(rounds: int) -> str:

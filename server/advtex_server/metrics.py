@@ -6,6 +6,7 @@ import time
 from collections import Counter as Tally
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import TypeVar
 
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Gauge, Histogram, generate_latest
@@ -16,6 +17,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from advtex_contract.jobs import STATES, WAITING, JobState
+from advtex_server.loops import Loop
 from advtex_store.counters import ATTEMPTS, FAILURES, JOBS, STAGE_BOUNDS, STAGE_BUCKETS, STAGES, Line
 from advtex_store.fleet import LivingWorker
 from advtex_store.models import CounterRow
@@ -68,7 +70,18 @@ class Metrics:
             "When the dispatcher's last round went well, since 1970; 0 where none has",
             registry=self.registry,
         )
+        self.failing = Gauge(
+            "advtex_background_failing_seconds",
+            "For how long a loop of this process has done nothing that went well; 0 where its last turn did",
+            ["loop"],
+            registry=self.registry,
+        )
         self.registry.register(FleetCollector(store, owners))
+
+    def watch(self, loops: Iterable[Loop]) -> None:
+        """Tell of what this process does in the background."""
+        for loop in loops:
+            self.failing.labels(loop.name).set_function(partial(getattr, loop, "failing_seconds"))
 
     def round(self, kind: str, act: Callable[[], T]) -> T:
         """Do a round of the dispatcher, and take its time if it goes well."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from datetime import UTC, datetime
 
 from pydantic import BaseModel
@@ -13,8 +13,9 @@ from starlette.concurrency import run_in_threadpool
 
 from advtex_options import Options
 from advtex_server.events import PING_SECONDS
+from advtex_server.waiting import tell_why, waiting_reason
 from advtex_store.models import JobRow
-from advtex_store.overviews import Overviews
+from advtex_store.store import Store
 
 POLL_SECONDS = 1.0
 LIFETIME_SECONDS = 300.0  # of a stream; the browser comes back, and has to be signed in still
@@ -55,7 +56,7 @@ def job_summary(row: JobRow) -> JobSummary:
         step=progress.get("step", 0),
         steps=progress.get("steps", 0),
         eta_seconds=progress.get("eta_seconds"),
-        waiting_reason=row.waiting_reason,
+        waiting_reason=waiting_reason(row, {}),
         problem=(row.error or {}).get("message", ""),
         created_at=datetime.fromtimestamp(row.created_at, UTC),
         finished_at=None if row.finished_at is None else datetime.fromtimestamp(row.finished_at, UTC),
@@ -63,7 +64,7 @@ def job_summary(row: JobRow) -> JobSummary:
     )
 
 
-async def stream_changes(overviews: Overviews, owner: str, since: float, stopping: asyncio.Event) -> AsyncIterator[str]:
+async def stream_changes(store: Store, owner: str, since: float, stopping: asyncio.Event) -> AsyncIterator[str]:
     """Server-sent `job` events, one per change of a job after `since`, for some minutes.
 
     Ids are times in milliseconds: a browser that comes back says the last one. What changed shortly before is sent
@@ -74,7 +75,7 @@ async def stream_changes(overviews: Overviews, owner: str, since: float, stoppin
     end = spoken + LIFETIME_SECONDS
     while not stopping.is_set() and time.monotonic() < end:
         try:
-            rows = await run_in_threadpool(overviews.changed, owner, newest - OVERLAP_SECONDS)
+            rows = await run_in_threadpool(changed, store, owner, newest - OVERLAP_SECONDS)
         except SQLAlchemyError:
             rows = []
         fresh = [row for row in rows if sent.get(row.id) != row.updated_at]
@@ -90,6 +91,13 @@ async def stream_changes(overviews: Overviews, owner: str, since: float, stoppin
             await asyncio.wait_for(stopping.wait(), POLL_SECONDS)
         except TimeoutError:
             continue
+
+
+def changed(store: Store, owner: str, since: float) -> Sequence[JobRow]:
+    """Rows that changed after a time, in the order of their changes, each with why its job waits."""
+    rows = store.overviews.changed(owner, since)
+    tell_why(store, owner, rows)
+    return rows
 
 
 def _message(row: JobRow) -> str:

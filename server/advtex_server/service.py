@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
@@ -13,7 +12,6 @@ import structlog
 from advtex_contract.errors import ErrorCode, ErrorDetail
 from advtex_contract.health import KeyView
 from advtex_contract.jobs import (
-    TERMINAL,
     WAITING,
     JobError,
     JobPage,
@@ -29,9 +27,11 @@ from advtex_contract.stored_options import read_options
 from advtex_options import refusal
 from advtex_options.outputs import kind_and_purpose
 from advtex_server.batches import BatchService
+from advtex_server.loops import Loop
 from advtex_server.older_clients import told
 from advtex_server.refusal import ApiError
 from advtex_server.settings import ServerSettings
+from advtex_server.waiting import is_late, tell_why, waiting_reason
 from advtex_store import keys
 from advtex_store.accounts import Caller
 from advtex_store.errors import BlobNotFound, ReferenceRefused
@@ -41,16 +41,14 @@ from advtex_store.store import Store
 from advtex_store.submissions import JobFilter, Reservation
 from advtex_store.tracing import OFF, Traces
 
-IN_CHECK = "its scan is being checked"
-IN_LINE = "a worker takes it when its turn comes"
-PAUSED = "its batch is paused; it waits until the batch is resumed"
-REASONS: Mapping[str, str] = {JobState.checking: IN_CHECK, **dict.fromkeys(WAITING, IN_LINE)}  # the usual ones
-
 log = structlog.get_logger("advtex.server")
 
 
 class Service:
-    """What a caller can do. `wake` is called when there is a scan to check, or a job for the workers."""
+    """What a caller can do. `wake` is called when there is a scan to check, or a job for the workers.
+
+    loops: what goes on in the background of the same process.
+    """
 
     def __init__(
         self,
@@ -58,8 +56,10 @@ class Service:
         settings: ServerSettings,
         wake: Callable[[], None] = lambda: None,
         traces: Traces = OFF,
+        loops: Sequence[Loop] = (),
     ) -> None:
         self.store = store
+        self.loops = loops
         self.settings = settings
         self.wake = wake
         self.traces = traces
@@ -126,13 +126,13 @@ class Service:
         """The row with the progress of this moment."""
         row = self.store.records.job(job_id, owner)
         self.store.live_progress.show([row])
-        self._tell_of_pauses(owner, [row])
+        tell_why(self.store, owner, [row])
         return row
 
     def jobs(self, owner: str, wanted: JobFilter, cursor: str | None, limit: int) -> JobPage:
         rows, following = self.store.submissions.list_jobs(owner, wanted, cursor=cursor, limit=limit)
         self.store.live_progress.show(rows)
-        self._tell_of_pauses(owner, rows)
+        tell_why(self.store, owner, rows)
         return JobPage(jobs=[told(job_view(row)) for row in rows], next_cursor=following)
 
     def cancel(self, owner: str, job_id: str) -> JobView:
@@ -183,14 +183,6 @@ class Service:
 
     # -- inside ---------------------------------------------------------------------------------------------------
 
-    def _tell_of_pauses(self, owner: str, rows: Sequence[JobRow]) -> None:
-        """Why jobs of paused batches wait. No row says so: it would have to be told to each that comes to wait."""
-        waiting = [row for row in rows if row.batch is not None and row.state in WAITING]
-        paused = self.store.batches.paused(owner) if waiting else ()
-        for row in waiting:
-            if row.batch in paused:
-                row.waiting_reason = PAUSED
-
     def _live_record(self, owner: str, job_id: str) -> LiveRecord | None:
         row = self.store.records.job(job_id, owner)
         return None if row.state == JobState.succeeded else self.store.live.read(job_id, row.attempt)
@@ -227,7 +219,7 @@ def job_view(row: JobRow) -> JobView:
         options=read_options(row.options),
         priority=row.priority,
         attempt=row.attempt - 1 if state in WAITING else row.attempt,
-        waiting_reason=row.waiting_reason or REASONS.get(state, "") if state not in TERMINAL else "",
+        waiting_reason=waiting_reason(row),
         memory_bytes=row.memory_bytes,
         progress=Progress.model_validate(row.progress),
         warnings=[ErrorDetail.model_validate(w) for w in row.warnings],
@@ -239,7 +231,7 @@ def job_view(row: JobRow) -> JobView:
         retention_seconds=row.retention_seconds,
         expires_at=_time(row.expires_at) if row.expires_at else None,
         deadline=_time(row.deadline) if row.deadline is not None else None,
-        late=row.deadline is not None and (row.finished_at or time.time()) > row.deadline,
+        late=is_late(row),
     )
 
 

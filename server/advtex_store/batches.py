@@ -15,6 +15,7 @@ from sqlalchemy.orm import Session
 from advtex_contract.jobs import PENDING, TERMINAL, JobState, Progress
 from advtex_store.database import Database
 from advtex_store.errors import RecordNotFound
+from advtex_store.lines import Allowance, read_holds, read_running
 from advtex_store.models import BatchRow, JobRow
 
 UNUSED_SECONDS = 3600.0  # what was said of a batch before its first job is kept this long
@@ -111,11 +112,11 @@ class Batches:
         with self.database.write() as session:
             self._say(session, owner, batch_id, {"max_running": max_running})
 
-    def paused(self, owner: str) -> frozenset[str]:
-        """The names of those that are paused."""
+    def allowance(self, owner: str) -> Allowance:
+        """Which of the owner's waiting jobs may begin, as it is now."""
         with self.database.read() as session:
-            query = select(BatchRow.id).where(BatchRow.owner == owner, BatchRow.paused_at.is_not(None))
-            return frozenset(session.scalars(query))
+            holds = read_holds(session, owner=owner)
+            return Allowance(holds, read_running(session, owner) if holds.most else {})
 
     def forget(self) -> None:
         """Drop what was said of batches that have no jobs any more."""

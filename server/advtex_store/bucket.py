@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -172,8 +172,8 @@ class Bucket:
                 yield upload["Key"].removeprefix(self._prefix), upload["UploadId"]
 
     def abort(self, name: str, upload_id: str) -> None:
-        """Drop all parts. BlobNotFound if that was done before."""
-        with self._translated(name):
+        """Drop all parts; no error if there are none any more."""
+        with suppress(BlobNotFound), self._translated(name):
             self._client.abort_multipart_upload(**self._named(name), UploadId=upload_id)
 
     # -- inside ---------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from sqlalchemy import func, select, update
 from advtex_contract.jobs import TERMINAL, WAITING, JobError, JobState
 from advtex_store import keys
 from advtex_store.counters import JOBS, count_end
-from advtex_store.errors import BlobNotFound, IllegalTransition, NotUnderstood, RecordNotFound, StaleAttempt
+from advtex_store.errors import BlobNotFound, IllegalTransition, NotUnderstood, RecordNotFound, StaleAttempt, StoreError
 from advtex_store.ids import ID, created_at
 from advtex_store.models import CounterRow, EventRow, JobRow, UploadRow
 from advtex_store.partials import Hold
@@ -174,12 +174,17 @@ def _make_again(store: Store, job: JobRow) -> str:
 
 
 def _give_up(store: Store, job: JobRow) -> str:
-    """What the servers' reconciler does, also for a job that it has set aside."""
-    if store.results.adopt(job.id):
-        return "succeeded: its results were there"
+    """What the servers' reconciler does, without waiting for a while whether what cannot be read can be read again."""
     try:
+        if store.results.adopt(job.id):
+            return "succeeded: its results were there"
         state = store.records.lost(job.id, job.attempt, expired_only=True)
     except StaleAttempt:
+        return NOT_MENDED
+    except (StoreError, OSError) as error:
+        with suppress(StaleAttempt):
+            store.results.end_unread(job.id, job.attempt, error, expired_only=True)
+            return f"failed: {error}"
         return NOT_MENDED
     return f"{state}: nobody has its attempt {job.attempt}"
 

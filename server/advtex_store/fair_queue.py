@@ -3,10 +3,17 @@
 Waiting rows of one owner, batch and priority that need the same memory are a line, and the index `ix_jobs_turn` holds
 every line in order. A look at who is next costs a probe per line and what is taken from them, however many rows wait
 behind those.
+
+Where there are more than LINES, a look sees some of them, and their order is that of the rules below among those: what
+each of a few owners has of the largest priority, oldest first, and LINES others, from a place that moves on at random
+from look to look. So each line is seen again and again, and none starves. Of 10,000 batches of one job each a look
+takes 61 ms instead of 973 on SQLite and 64 instead of 1060 on PostgreSQL, the least of 7 side by side on two busy cores
+(`pytest tests/store/test_fair_queue.py -k thousands` compares 2,000).
 """
 
 from __future__ import annotations
 
+import json
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -14,15 +21,21 @@ from dataclasses import dataclass
 from heapq import heapify, heappop, heappush, merge
 from itertools import islice
 from math import inf
+from random import choice
 from typing import Any, NamedTuple
 
-from sqlalchemy import CTE, JSON, ColumnElement, Select, TextClause, func, select, text
+from sqlalchemy import CTE, JSON, ColumnElement, FromClause, Select, Text, TextClause, cast, func, literal, select, text
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from advtex_contract.jobs import JobState
-from advtex_store.lines import Allowance, Line, read_holds
-from advtex_store.models import KEPT, WAITS_FOR_ITS_TURN, JobRow
+from advtex_store.lines import Allowance, Line, read_holds, read_running
+from advtex_store.models import WAITS_FOR_ITS_TURN, WAITS_IN_LINE, JobRow
 
+Column = InstrumentedAttribute[Any]
+
+LINES = 500  # that a look goes through
+OWNERS = 50  # of whom a look sees what is most urgent, where there are more lines
+HEADS = 4  # jobs of each owner and class of memory that it sees of those
 FIRST_DEPTH = 8  # rows that are read of every line at first
 AGING_SECONDS = 3600.0  # of waiting for which a batch that has nothing running counts as one step of priority more
 
@@ -34,6 +47,14 @@ class WaitingJob:
     id: str
     attempt: int
     state: JobState
+
+
+@dataclass(slots=True)
+class Gaze:
+    """Where the next look begins, if there are more lines than it goes through: behind this line, and this owner."""
+
+    line: str = ""
+    owner: str = ""
 
 
 class _Place(NamedTuple):
@@ -55,7 +76,12 @@ class _Cut(Exception):
 
 
 def next_jobs(
-    session: Session, limit: int, now: float, gib: int | None = None, offered: Collection[str] = ()
+    session: Session,
+    limit: int,
+    now: float,
+    gib: int | None = None,
+    offered: Collection[str] = (),
+    gaze: Gaze | None = None,
 ) -> list[WaitingJob]:
     """The waiting jobs that come next, of those that a worker of the class `gib` can take; None for any.
 
@@ -65,36 +91,88 @@ def next_jobs(
     and owners of which as many jobs run as may, have none.
 
     offered: ids of waiting jobs that are on their way to a worker; they are in their places, and count as running where
-    that is limited.
+    that is limited. gaze: where it looks, moved on; None for all lines, however many.
     """
     holds = read_holds(session, offered)
-    running = _running(session)
+    running = read_running(session)
     use_order_of_index(session)
+    seen = None if gaze is None else _seen_lines(session, gaze)
     depth = FIRST_DEPTH
     while True:
-        lines = _read_lines(session, depth, gib)
+        lines = _read_lines(session, depth, gib, seen)
         with suppress(_Cut):
             return list(islice(_take_turns(lines, running, Allowance(holds, running), now, depth), max(limit, 0)))
         depth *= 4
 
 
-def distinct_pairs(waits: TextClause, first: InstrumentedAttribute[Any], second: InstrumentedAttribute[Any]) -> CTE:
+def distinct_pairs(waits: TextClause, first: Column, second: Column, firsts: FromClause | None = None) -> CTE:
     """The pairs of values that waiting rows have in two columns, by a probe each of the index that begins with them.
 
     waits: the index's condition. The columns are called `first` and `second`; the last `second` of each `first` is
-    null. Neither database skips through an index by itself.
+    null. firsts: the values of the first column that count, in a column `first`; None for all. Neither database skips
+    through an index by itself.
     """
-
-    def least(column: InstrumentedAttribute[Any], *where: ColumnElement[bool]) -> Select[Any]:
-        return select(column).where(waits, *where).order_by(column).limit(1)
-
-    firsts = select(least(first).scalar_subquery().label("first")).cte("firsts", recursive=True)
-    following = least(first, first > firsts.c.first).scalar_subquery()
-    firsts = firsts.union_all(select(following).where(firsts.c.first.is_not(None)))
-    smallest = least(second, first == firsts.c.first).scalar_subquery().label("second")
+    if firsts is None:
+        firsts = _distinct(waits, first)
+    smallest = _least(waits, second, first == firsts.c.first).scalar_subquery().label("second")
     pairs = select(firsts.c.first, smallest).where(firsts.c.first.is_not(None)).cte("pairs", recursive=True)
-    larger = least(second, first == pairs.c.first, second > pairs.c.second).scalar_subquery()
+    larger = _least(waits, second, first == pairs.c.first, second > pairs.c.second).scalar_subquery()
     return pairs.union_all(select(pairs.c.first, larger).where(pairs.c.second.is_not(None)))
+
+
+def _distinct(waits: TextClause, column: Column, after: str | None = None, most: int | None = None) -> CTE:
+    """The values of a column, called `first`, the last of which is null unless there are more than `most`."""
+    where = () if after is None else (column > after,)
+    begin = select(_least(waits, column, *where).scalar_subquery().label("first"), literal(1).label("number"))
+    firsts = begin.cte("firsts", recursive=True)
+    following = _least(waits, column, column > firsts.c.first).scalar_subquery()
+    more = select(following, firsts.c.number + 1).where(firsts.c.first.is_not(None))
+    return firsts.union_all(more if most is None else more.where(firsts.c.number < most))
+
+
+def _least(waits: TextClause, column: Column, *where: ColumnElement[bool]) -> Select[Any]:
+    return select(column).where(waits, *where).order_by(column).limit(1)
+
+
+def _values(session: Session, waits: TextClause, column: Column, after: str, most: int) -> list[str]:
+    """Values behind `after`, as many as are asked for; and from the first one on, where these are not enough."""
+    found = [value for value in session.scalars(select(_distinct(waits, column, after, most).c.first)) if value]
+    if after and len(found) < most:
+        begin = select(_distinct(waits, column, None, most - len(found)).c.first)
+        found += {value for value in session.scalars(begin) if value} - set(found)
+    return found
+
+
+def _given(session: Session, values: Sequence[str]) -> FromClause:
+    """A table of these in a column `first`, whatever their number."""
+    given = literal(json.dumps(values), Text)
+    if session.get_bind().dialect.name == "sqlite":
+        table = func.json_each(given).table_valued("value")
+    else:
+        table = func.json_array_elements_text(cast(given, JSON)).table_valued("value")
+    return select(table.c.value.label("first")).cte("given")
+
+
+def _seen_lines(session: Session, gaze: Gaze) -> list[str] | None:
+    """Those that this look goes through; None for all."""
+    lines = _values(session, WAITS_FOR_ITS_TURN, JobRow.line, gaze.line, LINES + 1)
+    if len(lines) <= LINES:
+        return None
+    gaze.line = choice(lines)  # noqa: S311  no secret, and in step with nothing that makes looks
+    owners = _values(session, WAITS_IN_LINE, JobRow.owner, gaze.owner, OWNERS)
+    gaze.owner = owners[-1]
+    pairs = distinct_pairs(WAITS_IN_LINE, JobRow.owner, JobRow.memory_gib, _given(session, owners))
+    front = (
+        select(JobRow.line)
+        .where(WAITS_IN_LINE, JobRow.owner == pairs.c.first, JobRow.memory_gib == pairs.c.second)
+        .order_by(JobRow.state, JobRow.priority.desc(), JobRow.id)
+        .limit(HEADS)
+        .correlate(pairs)
+        .subquery()
+    )
+    gather = func.json_group_array if session.get_bind().dialect.name == "sqlite" else func.json_agg
+    heads = select(select(gather(front.c.line, type_=JSON)).scalar_subquery()).where(pairs.c.second.is_not(None))
+    return sorted({*lines, *(line for found in session.scalars(heads) for line in found or ())})
 
 
 def use_order_of_index(session: Session) -> None:
@@ -104,14 +182,12 @@ def use_order_of_index(session: Session) -> None:
         session.execute(text("set local enable_sort = off"))
 
 
-def _running(session: Session) -> Mapping[Line, int]:
-    query = select(JobRow.line, func.count()).where(JobRow.state == JobState.running, KEPT).group_by(JobRow.line)
-    return {Line.of(line): int(count) for line, count in session.execute(query)}
-
-
-def _read_lines(session: Session, depth: int, gib: int | None) -> Mapping[Line, list[Sequence[_Place]]]:
+def _read_lines(
+    session: Session, depth: int, gib: int | None, seen: Sequence[str] | None
+) -> Mapping[Line, list[Sequence[_Place]]]:
     """Line -> its first `depth` rows of each class of memory."""
-    pairs = distinct_pairs(WAITS_FOR_ITS_TURN, JobRow.line, JobRow.memory_gib)
+    firsts = None if seen is None else _given(session, seen)
+    pairs = distinct_pairs(WAITS_FOR_ITS_TURN, JobRow.line, JobRow.memory_gib, firsts)
     sqlite = session.get_bind().dialect.name == "sqlite"
     array, gather = (func.json_array, func.json_group_array) if sqlite else (func.json_build_array, func.json_agg)
     place = (JobRow.state, JobRow.due, JobRow.id, JobRow.attempt, JobRow.deadline, JobRow.created_at)

@@ -46,7 +46,7 @@ from advtex_store.accounts import check_active_jobs
 from advtex_store.counters import ATTEMPTS, count_one
 from advtex_store.database import Database
 from advtex_store.errors import IllegalTransition, NotUnderstood, StaleAttempt
-from advtex_store.fair_queue import WaitingJob, distinct_pairs, next_jobs, use_order_of_index
+from advtex_store.fair_queue import Gaze, WaitingJob, distinct_pairs, next_jobs, use_order_of_index
 from advtex_store.lines import read_holds
 from advtex_store.memory_estimate import GIB
 from advtex_store.models import KEPT, WAITS_FOR_A_REASON, EventRow, JobRow
@@ -90,6 +90,7 @@ class Records(Transitions):
     def __init__(self, database: Database, *, lease_seconds: float = 60.0) -> None:
         super().__init__(database)
         self.lease_seconds = lease_seconds
+        self._gaze = Gaze()
 
     # -- worker ---------------------------------------------------------------------------------------------------
 
@@ -192,9 +193,9 @@ class Records(Transitions):
             row = self.move(session, job_id, S.succeeded, fence=attempt, sources=sources, results=data)
             self.finish(session, row, warnings=[*row.warnings, *(w.model_dump(mode="json") for w in warnings)])
 
-    def fail(self, job_id: str, attempt: int, error: JobError) -> None:
-        """The attempt failed for a reason that a new attempt would meet again."""
-        self._end(job_id, attempt, S.failed, error)
+    def fail(self, job_id: str, attempt: int, error: JobError, *, expired_only: bool = False) -> None:
+        """The attempt failed for a reason that a new attempt would meet again. expired_only: as of `lost`."""
+        self._end(job_id, attempt, S.failed, error, expired_only=expired_only)
 
     def reject(self, job_id: str, attempt: int, error: JobError) -> None:
         """The engine found the scan unusable; `error.details` list every problem."""
@@ -221,9 +222,7 @@ class Records(Transitions):
         expired_only: only if the lease has run out (StaleAttempt if not), for callers that did not see it die.
         """
         with self.database.write() as session:
-            row = self._running(session, job_id, attempt)
-            if expired_only and (row.lease_expires_at or 0.0) > self.database.now(session):
-                raise StaleAttempt(f"job {job_id}: the lease of attempt {attempt} still holds")
+            row = self._running(session, job_id, attempt, expired_only=expired_only)
             if log_tail is not None:
                 row.log_tail = log_tail
             count_one(session, ATTEMPTS, "lost")
@@ -254,7 +253,7 @@ class Records(Transitions):
         """
         gib = None if memory_bytes is None else memory_bytes // GIB
         with self.database.read() as session:
-            return next_jobs(session, limit, self.database.now(session), gib, offered)
+            return next_jobs(session, limit, self.database.now(session), gib, offered, self._gaze)
 
     def ready(self, limit: int) -> dict[int, int]:
         """How many of the jobs that wait begin as soon as they have workers, by the GiB that they need; of those that
@@ -310,12 +309,13 @@ class Records(Transitions):
             if (left := left - len(ids)) == 0:
                 return
 
-    def expired(self, limit: int = 100) -> list[tuple[str, int]]:
-        """(job, attempt) whose lease has run out, of jobs that were not set aside."""
+    def expired(self, limit: int = 100, *, aside: bool = False) -> list[tuple[str, int]]:
+        """(job, attempt) whose lease has run out, of jobs that were set aside, or were not."""
         with self.database.read() as session:
             now = self.database.now(session)
             query = select(JobRow.id, JobRow.attempt).where(JobRow.state == S.running, KEPT)
-            query = query.where(JobRow.lease_expires_at < now, not_aside(ADOPT, JobRow.id, now))
+            wanted = not_aside(ADOPT, JobRow.id, now)
+            query = query.where(JobRow.lease_expires_at < now, ~wanted if aside else wanted)
             return [(job_id, attempt) for job_id, attempt in session.execute(query.limit(limit))]
 
     def count_by_state(self) -> dict[str, int]:
@@ -370,8 +370,12 @@ class Records(Transitions):
 
     # -- inside ---------------------------------------------------------------------------------------------------
 
-    def _end(self, job_id: str, attempt: int, to: JobState, error: JobError | None) -> None:
+    def _end(
+        self, job_id: str, attempt: int, to: JobState, error: JobError | None, *, expired_only: bool = False
+    ) -> None:
         with self.database.write() as session:
+            if expired_only:
+                self._running(session, job_id, attempt, expired_only=True)
             data = None if error is None else error.model_dump(mode="json")
             self.finish(
                 session, self.move(session, job_id, to, sources=frozenset({S.running}), fence=attempt, error=data)

@@ -6,12 +6,13 @@ import mimetypes
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
 from advtex_contract.errors import ErrorDetail
+from advtex_contract.jobs import JobError
 from advtex_store import keys
 from advtex_store.blobs import Blobs
-from advtex_store.errors import BlobNotFound, IllegalTransition
+from advtex_store.errors import BlobNotFound, IllegalTransition, ResultsUnreadable
 from advtex_store.records import Records
 
 CONTENT_TYPES = {
@@ -86,9 +87,29 @@ class Results:
             return self.records.job(job_id).state == "succeeded"
         return True
 
+    def end_unread(self, job_id: str, attempt: int, error: Exception, *, expired_only: bool = False) -> None:
+        """End a job of which `error` keeps everybody from reading whether it has finished; as `failed`, since nobody
+        can go on with it.
+
+        A retry makes the results again if their list is damaged, which goes for that, and else adopts them if they can
+        be read by then. expired_only, StaleAttempt: as of `Records.lost`.
+        """
+        if isinstance(error, ResultsUnreadable):
+            ending = JobError(code="results_lost", message=f"{error}; retry the job, and they are made again")
+        else:
+            message = f"it may have finished, but its results cannot be read: {type(error).__name__}: {error}"
+            ending = JobError(code="storage_refused", message=f"{message}; retry the job once the storage is mended")
+        self.records.fail(job_id, attempt, ending, expired_only=expired_only)
+        if isinstance(error, ResultsUnreadable):
+            self.blobs.delete(keys.result_manifest_key(job_id))
+
     def manifest(self, job_id: str) -> ResultManifest:
-        """The manifest, or BlobNotFound."""
-        return ResultManifest.model_validate_json(self.blobs.get(keys.result_manifest_key(job_id)))
+        """The manifest. BlobNotFound, ResultsUnreadable."""
+        data = self.blobs.get(key := keys.result_manifest_key(job_id))
+        try:
+            return ResultManifest.model_validate_json(data)
+        except ValidationError:
+            raise ResultsUnreadable(f"the list of the job's results is damaged ({key}, {len(data)} bytes)") from None
 
 
 def content_type(name: str) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 from advtex_store.blobs import BlobInfo, Blobs, check_key, check_prefix
@@ -58,8 +57,7 @@ class S3Blobs(Blobs):
             yield Unpublished(key, upload_id, superseded=marked != upload_id)
 
     def abort(self, found: Unpublished) -> None:
-        with suppress(BlobNotFound):
-            self.bucket.abort(found.key, found.upload_id)
+        self.bucket.abort(found.key, found.upload_id)
 
     def check(self) -> None:
         for _ in self.bucket.folders("jobs/none"):

@@ -71,10 +71,13 @@ class Transitions:
             raise RecordNotFound(f"there is no job {job_id}")
         return row
 
-    def _running(self, session: Session, job_id: str, attempt: int) -> JobRow:
+    def _running(self, session: Session, job_id: str, attempt: int, *, expired_only: bool = False) -> JobRow:
+        """The row of the attempt that has the job; with `expired_only` if its lease has run out. StaleAttempt."""
         row = session.scalar(select(JobRow).where(held(job_id, attempt)).with_for_update())
         if row is None:
             raise StaleAttempt(self._why_stale(session, job_id, attempt))
+        if expired_only and (row.lease_expires_at or 0.0) > self.database.now(session):
+            raise StaleAttempt(f"job {job_id}: the lease of attempt {attempt} still holds")
         return row
 
     def _why_stale(self, session: Session, job_id: str, attempt: int) -> str:

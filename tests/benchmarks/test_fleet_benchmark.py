@@ -2,44 +2,31 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
-from types import ModuleType
 
+import fleet
 import pytest
 from harness import Results
 
 
-@pytest.fixture(scope="module")
-def benchmark() -> ModuleType:
-    """Under a name of its own: the tests of faults have a helper that is called the same."""
-    spec = importlib.util.spec_from_file_location("fleet_benchmark", Path(__file__).with_name("fleet.py"))
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules["fleet_benchmark"] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.slow
-def test_a_tiny_fleet_is_measured(benchmark: ModuleType, tmp_path: Path, postgres_server: str) -> None:
+def test_a_tiny_fleet_is_measured(tmp_path: Path, postgres_server: str) -> None:
     results = Results(tmp_path / "fleet.json")
     for database, server in (("sqlite", None), ("postgresql", postgres_server)):
         for jobs in (40, 80):
-            benchmark.run(benchmark.Fleet(database, jobs, 6, seconds=1.0), False, results, server)
-            benchmark.run(benchmark.Fleet(database, jobs, 6, seconds=1.0), True, results, server)
-    page = benchmark.report(results.cells)
+            fleet.run(fleet.Fleet(database, jobs, 6, seconds=1.0), False, results, server)
+            fleet.run(fleet.Fleet(database, jobs, 6, seconds=1.0), True, results, server)
+    page = fleet.report(results.cells)
     assert page.count("| postgresql |") == page.count("| sqlite |") == 4
     assert page.count("grows with jobs") == 4
     for cell in results.cells:
         zero = [name for name, value in cell["scores"].items() if value <= 0 and name != "commits_per_s"]
         assert zero == [], cell
-    limited = {what for what, _, _ in benchmark.verdicts(results.cells)}
+    limited = {what for what, _, _ in fleet.verdicts(results.cells)}
     assert len(limited) == 7, "all four on PostgreSQL, and three of them on SQLite"
 
 
-def test_growth_is_a_power_of_the_number_of_jobs(benchmark: ModuleType) -> None:
+def test_growth_is_a_power_of_the_number_of_jobs() -> None:
     jobs = [1_000, 10_000, 100_000]
-    assert benchmark.exponent(jobs, [7.0, 7.0, 7.0]) == pytest.approx(0.0)
-    assert benchmark.exponent(jobs, [2.0, 20.0, 200.0]) == pytest.approx(1.0)
+    assert fleet.exponent(jobs, [7.0, 7.0, 7.0]) == pytest.approx(0.0)
+    assert fleet.exponent(jobs, [2.0, 20.0, 200.0]) == pytest.approx(1.0)

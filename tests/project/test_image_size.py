@@ -12,14 +12,21 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-DOCKERFILE = (ROOT / "docker" / "server.Dockerfile").read_text(encoding="utf-8")
+DOCKERFILE, WORKER = (
+    (ROOT / "docker" / f"{name}.Dockerfile").read_text(encoding="utf-8") for name in ("server", "worker")
+)
 BUDGET = 250e6
 BASE = 130e6  # of python:3.12-slim-bookworm, unpacked; rounded up
 HEAVY = {"torch", "numpy", "opencv-python-headless", "av", "imagecodecs", "usd-core"}
 
 
-def closure(extra: str) -> dict[str, Distribution]:
-    """What `pip install .[extra]` installs, but for the package itself."""
+def extras(dockerfile: str) -> str:
+    """What it installs of the package: `server,traces`."""
+    return re.findall(r"'\.\[([\w,]+)\]'", dockerfile)[0]
+
+
+def closure(extras: str) -> dict[str, Distribution]:
+    """What `pip install .[extras]` installs, but for the package itself."""
     found: dict[str, Distribution] = {}
     seen = set[tuple[str, str]]()
 
@@ -39,7 +46,7 @@ def closure(extra: str) -> dict[str, Distribution]:
             for further in lines:
                 visit(further, inner)
 
-    for line in (*PROJECT["dependencies"], f"{PROJECT['name']}[{extra}]"):
+    for line in (*PROJECT["dependencies"], f"{PROJECT['name']}[{extras}]"):
         visit(line, "")
     return found
 
@@ -56,7 +63,7 @@ def size(dist: Distribution) -> int:
 
 
 def test_the_servers_image_is_small() -> None:
-    installed = closure("server")
+    installed = closure(extras(DOCKERFILE))
     assert {"fastapi", "sqlalchemy", "psycopg-binary", "boto3", "httpx"} <= set(installed)
     assert not HEAVY & set(installed)
     own = sum(path.stat().st_size for path in ROOT.glob("[csw]*/advtex_*/**/*") if path.is_file())
@@ -71,3 +78,8 @@ def test_what_the_image_keeps_of_botocore_serves_object_storage() -> None:
         file.parts[2] for file in distribution("botocore").files or [] if file.parts[:2] == ("botocore", "data")
     }
     assert {"s3", "sts"} <= set(kept) <= services
+
+
+def test_both_images_can_send_traces() -> None:
+    for dockerfile in (DOCKERFILE, WORKER):
+        assert {"opentelemetry-sdk", "opentelemetry-exporter-otlp-proto-http"} <= set(closure(extras(dockerfile)))

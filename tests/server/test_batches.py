@@ -9,7 +9,10 @@ from typing import Any
 
 import pytest
 
-from advtex_contract.jobs import JobError
+from advtex_contract.jobs import JobError, JobState
+from advtex_server.overview import changed, job_summary
+from advtex_server.waiting import tell_why
+from advtex_store.submissions import JobFilter
 
 
 @pytest.fixture
@@ -136,6 +139,46 @@ def test_a_batch_is_paused_and_resumed(live: Any, scans: Path, is_error: Any) ->
     assert "paused" not in live.http.get(f"/v1/jobs/{waits}").json()["waiting_reason"]
     assert {job.id for job in live.store.records.waiting(10)} == {waits, alone}
     is_error(live.http.post("/v1/batches/none/pause"), 404, "not_found")
+
+
+@pytest.mark.one_machine("tests/store has the same on both databases")
+def test_a_job_says_which_limit_holds_it_and_that_it_is_late(
+    make_live: Callable[..., Any], scans: Path, redis_url: str
+) -> None:
+    live = make_live(reference_roots=scans.as_uri(), redis_url=redis_url)
+    live.store.queue.announce("w", 64, busy=True)
+    source, past = (scans / "good").as_uri(), "2020-01-01T00:00:00Z"
+    runs, waits = (live.job(source=source, batch="night", deadline=past)["id"] for _ in range(2))
+    alone = live.job(source=source)["id"]
+    live.store.records.claim(runs, 1, "test")
+
+    def reasons() -> dict[str, str]:
+        listed = {job["id"]: job["waiting_reason"] for job in live.http.get("/v1/jobs").json()["jobs"]}
+        assert listed == {job: live.http.get(f"/v1/jobs/{job}").json()["waiting_reason"] for job in listed}
+        assert listed.pop(runs) == ""
+        return listed
+
+    late = "; its deadline has passed, it runs all the same"
+    turn = "a worker takes it when its turn comes"
+    assert reasons() == {waits: turn + late, alone: turn}
+    live.http.put("/v1/batches/night/limits", json={"max_running": 1})
+    assert reasons() == {
+        waits: "as many jobs of its batch run as may at a time (1); it begins when one of them has ended" + late,
+        alone: turn,
+    }
+    live.http.put("/v1/batches/night/limits", json={})
+    live.store.accounts.create_key("small", owner="me", max_running_jobs=1)
+    mine = "as many of your jobs run as may at a time (1); it begins when one of them has ended"
+    assert reasons() == {waits: mine + late, alone: mine}
+    with live.client(None) as browser:
+        browser.post("/sign-in", data={"key": live.key}, headers={"Origin": live.url})
+        assert mine + late in browser.get("/").text
+    told = {row.id: job_summary(row).waiting_reason for row in changed(live.store, "me", 0.0)}
+    assert told == {runs: "", waits: mine + late, alone: mine}, "the list follows what changes"
+    (row,) = live.store.overviews.jobs("me", JobFilter(batch="night", state=JobState.queued), None, 9)[0]
+    row.waiting_reason = "no worker is running"
+    tell_why(live.store, "me", [row])
+    assert row.waiting_reason == "no worker is running", "more of a limit would not help"
 
 
 @pytest.mark.one_machine("tests/store has the same on both databases")

@@ -15,8 +15,9 @@ from checked import queued_job
 
 from advtex_contract.jobs import JobSpec
 from advtex_server.dispatch import Dispatcher
-from advtex_server.service import IN_LINE, job_view
+from advtex_server.service import job_view
 from advtex_server.settings import ServerSettings
+from advtex_server.waiting import IN_LINE
 from advtex_store import keys, queue
 from advtex_store.queue import PRESENCE, queue_name
 from advtex_store.store import Store, open_store

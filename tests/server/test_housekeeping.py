@@ -17,6 +17,7 @@ from advtex_server.metrics import FleetCollector
 from advtex_server.settings import ServerSettings
 from advtex_store import keys
 from advtex_store.blobs import FolderBlobs
+from advtex_store.consistency import disagreements
 from advtex_store.errors import BlobsUnavailable
 from advtex_store.models import JobRow
 from advtex_store.retention import ORPHAN_SECONDS
@@ -69,22 +70,53 @@ def test_an_unreadable_result_keeps_no_other_job_from_its_next_attempt(world: An
     clock[0] += LEASE + 1
     dispatcher.reconcile()
     assert store.records.job(good).state == "queued"
-    assert f"adopt {bad} failed 1 times: ValidationError" in told(store, dispatcher.settings)
+    assert f"adopt {bad} failed 1 times: ResultsUnreadable" in told(store, dispatcher.settings)
     assert metric(store, "adopt", "no") == 1
-    for _ in range(ROUNDS - 1):
+    for _ in range(ROUNDS - 2):
         dispatcher.reconcile()
-    assert "set aside" in told(store, dispatcher.settings)
-    assert (metric(store, "adopt", "no"), metric(store, "adopt", "yes")) == (0, 1)
-    dispatcher.reconcile()
-    (row,) = store.troubles.all()
-    assert row.rounds == ROUNDS, "what is set aside is not looked at"
+    assert store.records.job(bad).state == "running", "it may be readable again the next time"
 
-    store.blobs.delete(keys.result_manifest_key(bad))
-    clock[0] += ASIDE_SECONDS + 1
     dispatcher.reconcile()
-    assert store.records.job(bad).state == "queued"
+    row = store.records.job(bad)
+    assert row.state == "failed"
+    assert row.error is not None
+    assert row.error["code"] == "results_lost"
+    assert "retry the job" in row.error["message"]
     assert store.troubles.all() == []
     assert told(store, dispatcher.settings) == ""
+    store.records.retry(bad)
+    assert not store.results.adopt(bad), "the next attempt makes them again"
+
+
+def test_a_result_that_only_the_storage_keeps_back_is_adopted_by_a_retry(
+    world: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, dispatcher, clock = world
+    job = submit(store)
+    store.records.claim(job, 1, "w", lease_seconds=LEASE)
+    store.blobs.put(keys.result_manifest_key(job), b'{"attempt": 1, "files": []}')
+    clock[0] += LEASE + 1
+    with monkeypatch.context() as context:
+        context.setattr(FolderBlobs, "get", lambda *_: (_ for _ in ()).throw(OSError(5, "Input/output error")))
+        for _ in range(ROUNDS):
+            dispatcher.reconcile()
+    row = store.records.job(job)
+    assert row.error is not None
+    assert (row.state, row.error["code"]) == ("failed", "storage_refused")
+    store.records.retry(job)
+    assert store.results.adopt(job)
+
+
+def test_doctor_ends_such_a_job_at_once(world: Any) -> None:
+    store, _, clock = world
+    job = submit(store)
+    store.records.claim(job, 1, "w", lease_seconds=LEASE)
+    store.blobs.put(keys.result_manifest_key(job), UNREADABLE)
+    clock[0] += LEASE + 1
+    (found,) = [one for one in disagreements(store) if one.kind == "leases"]
+    assert found.mend is not None
+    assert found.mend().startswith("failed: the list of the job's results is damaged")
+    assert store.records.job(job).state == "failed"
 
 
 def test_an_unreadable_result_of_a_waiting_job_does_so_neither(world: Any) -> None:

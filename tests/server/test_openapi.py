@@ -49,6 +49,7 @@ def test_the_description_is_valid_and_every_call_is_described() -> None:
     for path, methods in description["paths"].items():
         for method, operation in methods.items():
             assert operation["summary"], (method, path)
+            assert len(operation["tags"]) == 1, (method, path, "is shown once for each")
             for status, answer in operation["responses"].items():
                 assert status.isdigit(), (method, path, status)
                 if int(status) >= 400 and path != "/readyz":

@@ -23,6 +23,7 @@ from standardwebhooks import Webhook
 from advtex_contract.jobs import JobError
 from advtex_server.targets import TargetRefused, TargetRules
 from advtex_store import webhooks as outbox
+from advtex_store.models import WebhookRow
 
 LOOPBACK = [ip_network("127.0.0.0/8")]
 pytestmark = pytest.mark.one_machine("the outbox runs on both databases in tests/store")
@@ -162,6 +163,19 @@ def test_a_dead_receiver_is_disabled_and_holds_up_nobody(local: Any, scan_zip: P
         assert "ConnectError" in view["last_error"]
         again = local.http.post(f"/v1/webhooks/{dead['id']}/enable").json()
         assert (again["disabled_at"], again["failures"]) == (None, 0)
+
+
+def test_what_cannot_be_sent_counts_as_failed_and_holds_up_nobody(local: Any, scan_zip: Path) -> None:
+    """Else it would be tried for ever, and nobody would be told."""
+    with receiver() as there:
+        bad, good = (hook(local, f"http://127.0.0.1:{there.port}/{name}")["id"] for name in ("bad", "good"))
+        with local.store.database.write() as session:
+            session.get(WebhookRow, bad).secret = "whsec_a"
+        fail_a_job(local, scan_zip)
+        view = until(local, bad, lambda view: view["disabled_at"] is not None)
+        assert view["last_error"].startswith("it cannot be sent: the server failed (")
+        there.wait(1)
+        assert until(local, good, lambda view: view["failures"] == 0)["disabled_at"] is None
 
 
 def test_redirects_are_not_followed(local: Any, scan_zip: Path) -> None:

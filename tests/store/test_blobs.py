@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from advtex_store.blobs import CHUNK, Blobs, FolderBlobs, check_key
 from advtex_store.bucket import Bucket
 from advtex_store.errors import BlobNotFound, BlobsRefused, BlobsUnavailable, NoSpace
+from advtex_store.partials import Unpublished
 from advtex_store.places import open_blobs
 
 BIG = os.urandom(1 << 20) * 20  # more than one part of a multipart upload
@@ -153,6 +154,15 @@ def test_no_key_leaves_the_storage(blobs: Blobs, key: str) -> None:
     for use in (blobs.create, blobs.get, blobs.head, blobs.delete):
         with pytest.raises(ValueError, match="no blob key"):
             use(key)
+
+
+def test_a_multipart_upload_that_is_not_under_way_is_aborted_again(blobs: Blobs, s3_url: str) -> None:
+    blobs.abort(Unpublished("scans/a/scan.zip", "none", superseded=True))
+    bucket = Bucket(s3_url.split("/")[2], os.urandom(6).hex())
+    upload_id = bucket.begin("scans/a/scan.zip")
+    for _ in range(2):  # two servers sweep, or an upload's piece has been dropped before
+        bucket.abort("scans/a/scan.zip", upload_id)
+    assert list(bucket.begun("scans")) == []
 
 
 def test_check(blobs: Blobs) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
@@ -16,7 +16,8 @@ from sqlalchemy import delete, func, insert, select
 
 from advtex_contract.jobs import JobState, Progress
 from advtex_contract.options import JobOptions
-from advtex_store.fair_queue import AGING_SECONDS
+from advtex_store import fair_queue
+from advtex_store.fair_queue import AGING_SECONDS, Gaze, next_jobs
 from advtex_store.ids import new_id
 from advtex_store.memory_estimate import GIB
 from advtex_store.models import BatchRow, JobRow
@@ -57,14 +58,17 @@ SAID = st.dictionaries(
 )
 
 
-def plain_order(bench: Any, limit: int, memory_bytes: int | None) -> list[str]:
-    """The twin: for every place the next job of each owner is chosen among all of them."""
+def plain_order(
+    bench: Any, limit: int, memory_bytes: int | None, seen: Container[tuple[str, str | None, int]] | None = None
+) -> list[str]:
+    """The twin: for every place the next job of each owner is chosen among all of them; `seen`: of these lines."""
     with bench.database.read() as session:
         rows = session.scalars(select(JobRow).where(JobRow.deleted_at.is_(None))).all()
         said = {(row.owner, row.id): row for row in session.scalars(select(BatchRow))}
     now = bench.clock.now
     waits = [row for row in rows if row.state in WAITING]
     waits = [row for row in waits if memory_bytes is None or row.memory_bytes <= memory_bytes]
+    waits = [row for row in waits if seen is None or (row.owner, row.batch, row.priority) in seen]
     running = [row for row in rows if row.state == JobState.running]
     owners = Counter(row.owner for row in running)
     batches = Counter((row.owner, row.batch) for row in running)
@@ -250,6 +254,64 @@ def test_a_look_costs_what_it_finds_and_not_what_waits(bench: Any) -> None:
 
     few, many = seconds(200), seconds(10_000)
     assert many < 4 * few, f"{1e3 * few:.1f} ms with 200 waiting jobs, {1e3 * many:.1f} ms with 10,000"
+
+
+@pytest.mark.benchmark
+def test_a_look_costs_no_more_with_thousands_of_batches(sqlite_bench: Any) -> None:
+    """Of one job each: what is bounded, beside what would be without."""
+    bench = sqlite_bench
+    jobs = [Job("abcde"[n % 5], memory=n % 3 * GIB, batch=f"b{n}") for n in range(2000)]
+    fill(bench, bench.finished_upload(), jobs)
+
+    def seconds(gaze: Gaze | None) -> float:
+        took = []
+        for _ in range(5):
+            began = time.perf_counter()
+            with bench.database.read() as session:
+                assert len(next_jobs(session, 20, bench.clock.now, 5, (), gaze)) == 20
+            took.append(time.perf_counter() - began)
+        return min(took)
+
+    bounded, whole = seconds(Gaze()), seconds(None)
+    assert bounded < 0.7 * whole, f"{1e3 * bounded:.1f} ms, {1e3 * whole:.1f} ms for all lines"
+
+
+@pytest.fixture
+def few_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fair_queue, "LINES", 3)
+    monkeypatch.setattr(fair_queue, "OWNERS", 2)
+    monkeypatch.setattr(fair_queue, "HEADS", 1)
+
+
+def test_more_lines_than_a_look_sees_are_all_seen_in_time(bench: Any, few_lines: None) -> None:
+    """Whoever is next in each look begins: the most urgent at once, and in the end all."""
+    jobs = [Job("a", batch=f"b{n:02}") for n in range(30)] + [Job("b", batch="x")]
+    fill(bench, bench.finished_upload(), [*jobs, Job("a", batch="zz", priority=9), Job("a", JobState.preempted)])
+    began = list[str | None]()
+    for _ in range(33):
+        (job,) = bench.records.waiting(1)
+        began.append(bench.records.job(job.id).batch)
+        bench.records.claim(job.id, job.attempt, "w")
+        bench.records.succeed(job.id, job.attempt, [])
+    assert bench.records.waiting(1) == []
+    assert set(began) == {job.batch for job in jobs} | {None, "zz"}
+    assert began[:3] == [None, "x", "zz"], "what was preempted, the owner who has nothing else, the largest priority"
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(jobs=st.lists(JOB, max_size=40), gib=st.sampled_from([None, 1, 24]))
+def test_among_those_that_a_look_sees_the_order_is_the_same(
+    sqlite_bench: Any, few_lines: None, jobs: list[Job], gib: int | None
+) -> None:
+    upload = getattr(sqlite_bench, "upload", None) or sqlite_bench.finished_upload()
+    sqlite_bench.upload = upload
+    fill(sqlite_bench, upload, jobs)
+    memory = None if gib is None else gib * GIB
+    for _ in range(3):
+        found = [job.id for job in sqlite_bench.records.waiting(100, memory)]
+        rows = [sqlite_bench.records.job(job) for job in found]
+        seen = {(row.owner, row.batch, row.priority) for row in rows}
+        assert found == plain_order(sqlite_bench, 100, memory, seen)
 
 
 def test_servers_that_tell_why_jobs_wait_at_once_tell_each_job_once(bench: Any) -> None:

@@ -184,7 +184,7 @@ def test_a_sigterm_to_the_runner_alone_is_a_preemption_too(store: Store, host: H
 def test_a_storage_that_fails_for_a_while_delays_the_results(
     store: Store, host: Hosts, new_job: NewJob, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("advtex_worker.attempt.RETRY_SECONDS", 0.0)
+    monkeypatch.setattr("advtex_worker.patience.RETRY_SECONDS", 0.0)
     commit, troubles = Results.commit, iter([NoSpace("the disk is full"), BlobsUnavailable("no answer")])
 
     def flaky(*arguments: Any) -> Any:
@@ -211,7 +211,7 @@ REFUSALS = [
 def test_a_refusal_that_stays_ends_the_job_with_its_reason_after_a_while(
     store: Store, settings: WorkerSettings, new_job: NewJob, monkeypatch: pytest.MonkeyPatch, refusal: Exception
 ) -> None:
-    monkeypatch.setattr("advtex_worker.attempt.RETRY_SECONDS", 0.5)
+    monkeypatch.setattr("advtex_worker.patience.RETRY_SECONDS", 0.5)
 
     def refused(*_: Any) -> None:
         raise refusal
@@ -240,7 +240,7 @@ def test_an_outage_and_a_refusal_that_is_mended_cost_nothing(
     store: Store, settings: WorkerSettings, new_job: NewJob, monkeypatch: pytest.MonkeyPatch, trouble: Exception
 ) -> None:
     """Outages may last longer than refusals."""
-    monkeypatch.setattr("advtex_worker.attempt.RETRY_SECONDS", 0.5)
+    monkeypatch.setattr("advtex_worker.patience.RETRY_SECONDS", 0.5)
     fetch, began = Attempt._fetch_scan, time.monotonic()
 
     def troubled(self: Attempt) -> None:
@@ -256,6 +256,22 @@ def test_an_outage_and_a_refusal_that_is_mended_cost_nothing(
     thread.join()
     row = store.records.job(job_id)
     assert (row.state, row.attempt, row.waiting_reason) == (JobState.succeeded, 1, "")
+
+
+@pytest.mark.one_machine("the manifest is a blob like any other")
+def test_a_list_of_results_that_is_damaged_ends_the_job_with_that_reason(
+    store: Store, host: Hosts, new_job: NewJob
+) -> None:
+    """An attempt cannot adopt them, and could not commit its own."""
+    job_id = new_job()
+    store.blobs.put(keys.result_manifest_key(job_id), b'{"attempt": 1}')
+    run_attempt(host("quick"), job_id, 1)
+    row = store.records.job(job_id)
+    assert row.error is not None
+    assert (row.state, row.deaths, row.error["code"]) == (JobState.failed, 0, "results_lost")
+    store.records.retry(job_id)
+    run_attempt(host("quick"), job_id, 2)
+    assert store.records.job(job_id).state == JobState.succeeded
 
 
 def test_a_flaw_of_the_worker_itself_is_a_death_with_its_traceback(

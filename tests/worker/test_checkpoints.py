@@ -12,7 +12,7 @@ import pytest
 from advtex_store import keys
 from advtex_store.blobs import Blobs, Written
 from advtex_store.errors import NoSpace
-from advtex_worker.checkpoints import EMPTY, CheckpointIndex, CheckpointUploader, restore
+from advtex_worker.checkpoints import EMPTY, INDEX, CheckpointIndex, CheckpointUploader, restore
 
 JOB = "0" * 28
 
@@ -95,7 +95,7 @@ def test_a_checkpoint_without_its_index_is_not_there(blobs: Blobs, tmp_path: Pat
     assert restored(blobs, 3, tmp_path / "work") == {"state": "whole"}
 
 
-@pytest.mark.parametrize("harm", ["missing", "damaged"])
+@pytest.mark.parametrize("harm", ["missing", "damaged", "index", "name"])
 def test_a_broken_checkpoint_is_passed_over_for_an_older_one(blobs: Blobs, tmp_path: Path, harm: str) -> None:
     for attempt, text in ((1, "old"), (2, "new")):
         up = uploader(blobs, attempt)
@@ -104,6 +104,10 @@ def test_a_broken_checkpoint_is_passed_over_for_an_older_one(blobs: Blobs, tmp_p
     victim = next(file for file in restore(blobs, JOB, 3, tmp_path / "w").files.values() if file.size == 3)
     if harm == "missing":
         blobs.delete(victim.key)
+    elif harm in ("index", "name"):
+        place = keys.checkpoint_prefix(JOB, 2) + INDEX
+        wrong = b"}" if harm == "index" else blobs.get(place).replace(b'"jobs/', b'"j//s/')
+        blobs.put(place, wrong)
     else:
         blobs.put(victim.key, b"odd")
     assert restored(blobs, 3, tmp_path / "work") == {"state": "old", "only in 1": "x"}

@@ -222,7 +222,7 @@ def test_jobs_on_one_scan_download_it_once_from_object_storage(
 def test_a_full_disk_takes_the_room_of_scans_that_nobody_uses(
     store: Store, settings: WorkerSettings, new_job: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("advtex_worker.attempt.RETRY_SECONDS", 0.5)
+    monkeypatch.setattr("advtex_worker.patience.RETRY_SECONDS", 0.5)
     given = Host(settings.model_copy(update={"cache_bytes": 1000}), engine="fake_engines:quick")
     run_attempt(given, new_job(), 1)
     assert len(list(settings.scan_cache.iterdir())) == 1

@@ -95,3 +95,5 @@ class Ahead:
                 return
             except (RedisError, SQLAlchemyError, StoreError, OSError) as error:
                 log.info("cannot look ahead", error=str(error))
+            except Exception:
+                log.exception("a look ahead failed")

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import structlog
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from advtex_contract.errors import ErrorDetail
 from advtex_store import keys
@@ -80,6 +80,9 @@ def _read_index(blobs: Blobs, job_id: str, attempt: int) -> CheckpointIndex | No
         return CheckpointIndex.model_validate_json(blobs.get(_index_key(job_id, attempt)))
     except BlobNotFound:
         return None
+    except ValidationError:
+        log.warning("checkpoint passed over: its index is damaged", job=job_id, attempt=attempt)
+        return None
 
 
 def _fetched(blobs: Blobs, index: CheckpointIndex, work: Path) -> bool:
@@ -88,7 +91,7 @@ def _fetched(blobs: Blobs, index: CheckpointIndex, work: Path) -> bool:
         try:
             if blobs.fetch(file.key, work / name).sha256 != file.sha256:
                 return False
-        except BlobNotFound:
+        except (BlobNotFound, ValueError):  # or the index names what is no key
             return False
     return True
 

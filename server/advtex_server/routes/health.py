@@ -13,19 +13,23 @@ from advtex_server.health import checks
 from advtex_server.metrics_access import MetricsAccess
 from advtex_server.refusal import WITH_KEY, refuses
 
-router = APIRouter(tags=["operation"])
+router = APIRouter()
 
 
-@router.get("/healthz")
+@router.get("/healthz", tags=["operation"])
 async def healthz() -> Alive:
     """The process answers."""
     return Alive()
 
 
-@router.get("/readyz", responses={503: {"model": Readiness, "description": "something essential does not work"}})
+@router.get(
+    "/readyz",
+    tags=["operation"],
+    responses={503: {"model": Readiness, "description": "something essential does not work"}},
+)
 def readyz(service: TheService, response: Response) -> Readiness:
     """Whether work can be accepted, with one sentence per part that does not work."""
-    found = checks(service.store, service.settings)
+    found = checks(service.store, service.settings, service.loops)
     ready = all(check.ok or not check.essential for check in found)
     response.status_code = 200 if ready else 503
     parts = {c.name: PartView(ok=c.ok, essential=c.essential, message=c.message) for c in found}
@@ -40,6 +44,7 @@ def get_key(caller: Anyone, service: TheService) -> KeyView:
 
 @router.get(
     "/metrics",
+    tags=["operation"],
     response_class=Response,
     responses={200: {"content": {"text/plain": {}}}, **WITH_KEY, **refuses(ErrorCode.not_found)},
 )

@@ -51,6 +51,42 @@ def test_files_of_another_run_and_broken_files_are_ignored(tmp_path: Path) -> No
     assert folder.load("stage") is None
 
 
+@pytest.mark.parametrize("mapped", [False, True])
+def test_no_byte_of_a_file_changes_unnoticed(tmp_path: Path, mapped: bool) -> None:
+    """Wherever it flips: what is loaded is what was saved, or nothing."""
+    folder, numbers = WorkFolder(tmp_path, "run", Monitor()), torch.arange(256, dtype=torch.float32)
+    folder.save("stage", {"tensor": numbers, "step": 7})
+    path = tmp_path / "stage.pt"
+    whole = path.read_bytes()
+    first = whole.index(numbers.numpy().tobytes())
+    places = [*range(first, first + 1024, 64), *range(0, len(whole), 23)]
+    lost = 0
+    for place in places:
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        loaded = folder.load("stage", mapped=mapped)
+        if loaded is None:
+            lost += 1
+        else:
+            assert torch.equal(loaded["tensor"], numbers), place
+            assert loaded["step"] == 7, place
+    assert lost >= 16, "the numbers' own"
+
+
+def test_a_damaged_file_is_told_of(tmp_path: Path) -> None:
+    class Notes(Monitor):
+        told = ""
+
+        def note(self, message: str) -> None:
+            self.told = message
+
+    folder = WorkFolder(tmp_path, "run", notes := Notes())
+    folder.save("checkpoint", {"tensor": torch.ones(64)})
+    path = tmp_path / "checkpoint.pt"
+    path.write_bytes(path.read_bytes().replace(torch.ones(64).numpy().tobytes(), torch.zeros(64).numpy().tobytes()))
+    assert folder.load("checkpoint") is None
+    assert notes.told.startswith("checkpoint.pt in the work folder is damaged (its record ")
+
+
 def test_a_write_that_fails_leaves_the_file_before_it(tmp_path: Path) -> None:
     folder = WorkFolder(tmp_path, "run", Monitor())
     folder.save("stage", {"a": 1})

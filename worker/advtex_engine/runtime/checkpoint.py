@@ -2,12 +2,13 @@
 
 Every file is written to a temporary name, fsynced and renamed: after a kill a file is whole or absent. Each carries the
 run's fingerprint (scan, options, numbers of the presets and FORMAT); a file of another run or of another version of the
-engine is ignored, as is one that is broken.
+engine is ignored, as is one that is broken or of which a single byte is not what was written.
 """
 
 from __future__ import annotations
 
 import time
+import zipfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -60,6 +61,9 @@ class WorkFolder:
         if not target.exists():
             return None
         try:
+            if (record := damaged_record(target)) is not None:
+                self._note(name, f"is damaged (its record {record})")
+                return None
             content = torch.load(target, map_location="cpu", weights_only=True, mmap=mapped)
         except Exception as error:  # of nearly any kind, by what is broken
             if memory_problem(error) is not None:
@@ -84,6 +88,16 @@ class WorkFolder:
         """Removes what an earlier run left."""
         for file in self.path.glob("*.pt"):
             file.unlink()
+
+
+def damaged_record(path: Path) -> str | None:
+    """The first record of a file of torch's whose bytes do not have the CRC-32 beside them; None if all are whole.
+
+    torch writes it with each record, and does not look at it when it reads: a number of a tensor could be any other.
+    Reads the file once, 0.6 to 0.9 GB/s on one core. BadZipFile where the file's structure is broken.
+    """
+    with zipfile.ZipFile(path) as records:
+        return records.testzip()
 
 
 class _Watched:

@@ -1,5 +1,6 @@
 // What a finished job is: the model, its files, what the report says.
 
+import { textureAgain } from "./again.js";
 import { showAtlas } from "./atlas.js";
 import { bytes, count, duration, el, findings, stageName } from "./base.js";
 import { showComparison } from "./compare.js";
@@ -37,7 +38,7 @@ export async function showResult(job) {
   showDownloads(job.results);
   const [manifest, report] = await Promise.all([
     loaded(address("previews/manifest.json")).catch(() => null), loaded(address("report.json")).catch(() => null)]);
-  showModel(byId("model"), manifest, address);
+  showModel(byId("model"), manifest, address, { box: job.options.box, send: (box) => textureAgain(job, box) });
   if (manifest) {
     showComparison(byId("compare"), manifest.views ?? [], address);
     showAtlas(byId("atlas"), manifest.atlas ?? [], address);

@@ -1,16 +1,17 @@
 // The model in 3D: model-viewer with what one can do there, or pictures where it cannot draw.
 
 import { backgroundChoice, lightChoice, seenChoice, setLight } from "./appearance.js";
-import { el } from "./base.js";
+import { el } from "./element.js";
 import { orientationRows } from "./cameras.js";
+import { cropping } from "./crop.js";
 import { measuring } from "./measure.js";
 import { Photographs, lumigraphButton, photographChoice } from "./photographs.js";
 
 const PATIENCE_MS = 15000;
 const TOUCHED = matchMedia("(pointer: coarse)"); // phones and tablets: they get the small model, where there is one
 
-/** manifest: of the previews, or null. address: the URL of a result file, null if there is none. */
-export function showModel(section, manifest, address) {
+/** manifest: of the previews, or null. address: the URL of a result file, null if there is none. crop: see `cropping`. */
+export function showModel(section, manifest, address, crop = {}) {
   const stage = el("div", { class: "stage" });
   section.append(stage);
   const url = (TOUCHED.matches && address("model_mobile.glb")) || address("model.glb");
@@ -32,7 +33,7 @@ export function showModel(section, manifest, address) {
     clearTimeout(late);
     wait.remove();
     setLight(viewer, "photographed");
-    section.append(tools(viewer, stage, url, manifest, address));
+    section.append(tools(viewer, stage, url, manifest, address, crop));
   }, { once: true });
   function fallBack() {
     clearTimeout(late);
@@ -53,12 +54,14 @@ function start(viewer, stage, orbit) {
   viewer.setAttribute("field-of-view", `${orbit.field_of_view}deg`);
 }
 
-function tools(viewer, stage, url, manifest, address) {
+function tools(viewer, stage, url, manifest, address, crop) {
   const said = el("p", { class: "hint", role: "status" });
-  const bar = el("div", { class: "toolbar tools" }, lightChoice(viewer), backgroundChoice(stage), seenChoice(viewer, seenPages(address)),
-    measuring(viewer, stage, said), arButton(viewer, address("model.usdz"), said));
-  if (manifest?.photographs && manifest.orbit) addPhotographs(bar, viewer, stage, url, manifest, address, said);
-  return el("div", {}, bar, said);
+  const stand = orientationRows(manifest?.orbit?.orientation ?? [0, 0, 0]);
+  const [button, panel] = cropping(viewer, stage, url, stand, said, crop);
+  const bar = el("div", { class: "toolbar tools" }, lightChoice(viewer), backgroundChoice(stage), seenChoice(viewer, url === address("model.glb") ? seenPages(address) : []),
+    measuring(viewer, stage, said), button, arButton(viewer, address("model.usdz"), said));
+  if (manifest?.photographs && manifest.orbit) addPhotographs(bar, viewer, stage, url, manifest, address, stand, said);
+  return el("div", {}, bar, said, panel);
 }
 
 function seenPages(address) {
@@ -66,11 +69,10 @@ function seenPages(address) {
   return names.map(address).filter(Boolean);
 }
 
-async function addPhotographs(bar, viewer, stage, url, { photographs, orbit }, address, said) {
+async function addPhotographs(bar, viewer, stage, url, { photographs, orbit }, address, stand, said) {
   const listed = await fetch(address(photographs)).then((answer) => (answer.ok ? answer.json() : null)).catch(() => null);
   if (!listed) return;
   const found = new Photographs(listed, address);
-  const stand = orientationRows(orbit.orientation);
   bar.append(photographChoice(viewer, stage, found, orbit, stand), lumigraphButton(viewer, stage, found, url, stand, said));
 }
 

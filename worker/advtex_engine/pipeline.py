@@ -129,7 +129,7 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
     }
     report = assembled(config, given.preset, budget.device, budget.monitor.warnings, parts)
     files += (write_report(out, report),)
-    return RunResult((*files, write_page(out, report, files)), report)
+    return RunResult((*files, *write_page(out, report, files)), report)
 
 
 def _scene(

@@ -23,6 +23,7 @@ SHORT = (
     JobRow.options,
     JobRow.progress,
     JobRow.waiting_reason,
+    JobRow.deadline,
     JobRow.error,
     JobRow.created_at,
     JobRow.updated_at,

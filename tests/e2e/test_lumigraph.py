@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import cv2
 import numpy as np
@@ -99,6 +100,23 @@ def test_the_page_crops_what_the_engine_crops(page: Page) -> None:
     wanted = [in_box(points, parse_box(box), up_axis).tolist() for up_axis in TO_Y_UP]
     assert inside == wanted
     assert wanted[0] != wanted[1], "the turn's sense is told apart"
+
+
+def test_scene_viewer_is_given_the_whole_address_of_a_link(page: Page) -> None:
+    intent = page.evaluate(
+        """import("/viewer.js").then(({ sceneViewer }) => sceneViewer("/links/a.1.b/c/model.glb"))"""
+    )
+    place, _, app = intent.partition("#Intent;")
+    assert urlsplit(place)[:3] == ("intent", "arvr.google.com", "/scene-viewer/1.0")
+    assert parse_qs(urlsplit(place).query) == {
+        "file": ["http://page/links/a.1.b/c/model.glb"],
+        "mode": ["ar_preferred"],
+        "resizable": ["false"],
+    }
+    told = dict(part.split("=", 1) for part in app.removesuffix(";end;").split(";"))
+    assert told["scheme"] == "https"
+    assert told["package"] == "com.google.android.googlequicksearchbox"
+    assert told["S.browser_fallback_url"] == "http%3A%2F%2Fpage%2F"
 
 
 def decoded(jpeg: bytes) -> torch.Tensor:

@@ -97,7 +97,7 @@ export class CropBox {
     return [
       ...[0, 1, 2].flatMap((axis) => [side(axis, -1), side(axis, 1)]),
       this.handle("Middle of the box", "middle", () => this.place.center, (from, to) => this.carry(from, to), move),
-      this.handle("Turn of the box", "turn", () => corner(this.place, TURNS_BY), (from, to) => this.swing(from, to), ([, step]) => this.turn(step * TURN)),
+      this.handle("Turn of the box", "swing", () => corner(this.place, TURNS_BY), (from, to) => this.swing(from, to), ([, step]) => this.turn(step * TURN)),
     ];
   }
 
@@ -179,7 +179,7 @@ export class CropBox {
     for (const { knob, where } of this.handles) {
       const { x, y, depth } = this.seen(where());
       knob.hidden = depth < NEAR || x < 0 || y < 0 || x > width || y > height;
-      [knob.style.left, knob.style.top] = [`${x}px`, `${y}px`];
+      Object.assign(knob.style, { left: `${x}px`, top: `${y}px`, zIndex: knob.hidden ? 0 : Math.round(1000 / depth) }); // the nearer, the higher
     }
   }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator
 from datetime import UTC, datetime
 
 from pydantic import BaseModel
@@ -13,8 +13,8 @@ from starlette.concurrency import run_in_threadpool
 
 from advtex_options import Options
 from advtex_server.events import PING_SECONDS
-from advtex_server.service import Service, is_late
 from advtex_store.models import JobRow
+from advtex_store.overviews import Overviews
 
 POLL_SECONDS = 1.0
 LIFETIME_SECONDS = 300.0  # of a stream; the browser comes back, and has to be signed in still
@@ -35,7 +35,6 @@ class JobSummary(BaseModel):
     steps: int
     eta_seconds: float | None
     waiting_reason: str
-    late: bool
     problem: str
     created_at: datetime
     finished_at: datetime | None
@@ -57,7 +56,6 @@ def job_summary(row: JobRow) -> JobSummary:
         steps=progress.get("steps", 0),
         eta_seconds=progress.get("eta_seconds"),
         waiting_reason=row.waiting_reason,
-        late=is_late(row),
         problem=(row.error or {}).get("message", ""),
         created_at=datetime.fromtimestamp(row.created_at, UTC),
         finished_at=None if row.finished_at is None else datetime.fromtimestamp(row.finished_at, UTC),
@@ -65,7 +63,7 @@ def job_summary(row: JobRow) -> JobSummary:
     )
 
 
-async def stream_changes(service: Service, owner: str, since: float, stopping: asyncio.Event) -> AsyncIterator[str]:
+async def stream_changes(overviews: Overviews, owner: str, since: float, stopping: asyncio.Event) -> AsyncIterator[str]:
     """Server-sent `job` events, one per change of a job after `since`, for some minutes.
 
     Ids are times in milliseconds: a browser that comes back says the last one. What changed shortly before is sent
@@ -76,7 +74,7 @@ async def stream_changes(service: Service, owner: str, since: float, stopping: a
     end = spoken + LIFETIME_SECONDS
     while not stopping.is_set() and time.monotonic() < end:
         try:
-            rows = await run_in_threadpool(_changed, service, owner, newest - OVERLAP_SECONDS)
+            rows = await run_in_threadpool(overviews.changed, owner, newest - OVERLAP_SECONDS)
         except SQLAlchemyError:
             rows = []
         fresh = [row for row in rows if sent.get(row.id) != row.updated_at]
@@ -92,12 +90,6 @@ async def stream_changes(service: Service, owner: str, since: float, stopping: a
             await asyncio.wait_for(stopping.wait(), POLL_SECONDS)
         except TimeoutError:
             continue
-
-
-def _changed(service: Service, owner: str, since: float) -> Sequence[JobRow]:
-    rows = service.store.overviews.changed(owner, since)
-    service.tell_of_pauses(owner, rows)
-    return rows
 
 
 def _message(row: JobRow) -> str:

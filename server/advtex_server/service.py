@@ -126,13 +126,13 @@ class Service:
         """The row with the progress of this moment."""
         row = self.store.records.job(job_id, owner)
         self.store.live_progress.show([row])
-        self.tell_of_pauses(owner, [row])
+        self._tell_of_pauses(owner, [row])
         return row
 
     def jobs(self, owner: str, wanted: JobFilter, cursor: str | None, limit: int) -> JobPage:
         rows, following = self.store.submissions.list_jobs(owner, wanted, cursor=cursor, limit=limit)
         self.store.live_progress.show(rows)
-        self.tell_of_pauses(owner, rows)
+        self._tell_of_pauses(owner, rows)
         return JobPage(jobs=[told(job_view(row)) for row in rows], next_cursor=following)
 
     def cancel(self, owner: str, job_id: str) -> JobView:
@@ -194,15 +194,15 @@ class Service:
                 return picture.jpeg
         raise ApiError(ErrorCode.not_found, f"job {job_id} has no live picture {name!r} now")
 
-    def tell_of_pauses(self, owner: str, rows: Sequence[JobRow]) -> None:
+    # -- inside ---------------------------------------------------------------------------------------------------
+
+    def _tell_of_pauses(self, owner: str, rows: Sequence[JobRow]) -> None:
         """Why jobs of paused batches wait. No row says so: it would have to be told to each that comes to wait."""
         waiting = [row for row in rows if row.batch is not None and row.state in WAITING]
         paused = self.store.batches.paused(owner) if waiting else ()
         for row in waiting:
             if row.batch in paused:
                 row.waiting_reason = PAUSED
-
-    # -- inside ---------------------------------------------------------------------------------------------------
 
     def _live_record(self, owner: str, job_id: str) -> LiveRecord | None:
         row = self.store.records.job(job_id, owner)
@@ -252,13 +252,8 @@ def job_view(row: JobRow) -> JobView:
         retention_seconds=row.retention_seconds,
         expires_at=_time(row.expires_at) if row.expires_at else None,
         deadline=_time(row.deadline) if row.deadline is not None else None,
-        late=is_late(row),
+        late=row.deadline is not None and (row.finished_at or time.time()) > row.deadline,
     )
-
-
-def is_late(row: JobRow) -> bool:
-    """Whether it ended after its deadline, or goes on though that has passed."""
-    return row.deadline is not None and (row.finished_at or time.time()) > row.deadline
 
 
 def _result_file(job_id: str, stored: Mapping[str, Any]) -> ResultFile:

@@ -23,7 +23,6 @@ SHORT = (
     JobRow.options,
     JobRow.progress,
     JobRow.waiting_reason,
-    JobRow.deadline,
     JobRow.error,
     JobRow.created_at,
     JobRow.updated_at,

@@ -110,7 +110,6 @@ async def jobs_page(
     store = service.store
     now = await run_in_threadpool(store.overviews.now)
     rows, following = await run_in_threadpool(store.overviews.jobs, caller.owner, wanted, cursor or None, PAGE_JOBS)
-    await run_in_threadpool(service.tell_of_pauses, caller.owner, rows)
     batches = await run_in_threadpool(service.batches.page, caller.owner, None, PAGE_BATCHES)
     data = {
         "jobs": [job_summary(row).model_dump(mode="json") for row in rows],
@@ -189,7 +188,7 @@ async def changes(
         return Response(status_code=401)
     since = int(last_event_id) if last_event_id.isascii() and last_event_id.isdigit() else after
     stopping = request.app.state.stopping
-    events = stream_changes(service, caller.owner, min(since, 2**50) / 1000, stopping)
+    events = stream_changes(service.store.overviews, caller.owner, min(since, 2**50) / 1000, stopping)
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     events = while_welcome(events, partial(_sessions(request).find, request))
     return StreamingResponse(events, media_type="text/event-stream", headers=headers)

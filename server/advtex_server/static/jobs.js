@@ -34,7 +34,7 @@ function row(job) {
   const facts = [job.preset, job.method === USUAL_METHOD ? null : job.method, job.batch && `batch ${job.batch}`];
   const name = el("div", {},
     el("a", { href: `/jobs/${job.id}` }, job.label || `Job ${job.id.slice(-6)}`),
-    el("p", { class: "hint" }, facts.filter(Boolean).join(" · "), " · ", moment(job.created_at), job.late && " · ", job.late && el("strong", { class: "late" }, "late")));
+    el("p", { class: "hint" }, facts.filter(Boolean).join(" · "), " · ", moment(job.created_at)));
   const item = el("li", { class: "job", "data-id": job.id }, thumbnail(job), name, work(job), badge(job.state));
   item.job = job;
   return item;

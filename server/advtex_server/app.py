@@ -23,7 +23,7 @@ from advtex_server.metrics import Metrics, MetricsMiddleware
 from advtex_server.metrics_access import MetricsAccess
 from advtex_server.older_clients import OlderClientsMiddleware
 from advtex_server.refusal import ANYWHERE
-from advtex_server.routes import batches, health, jobs, pages, uploads, webhooks
+from advtex_server.routes import batches, health, jobs, links, pages, uploads, webhooks
 from advtex_server.service import Service
 from advtex_server.settings import ServerSettings
 from advtex_server.tus import TusMiddleware
@@ -90,6 +90,6 @@ def create_app(settings: ServerSettings, *, dispatch: bool = True) -> FastAPI:
     app.add_middleware(TusMiddleware)
     app.add_middleware(MetricsMiddleware, metrics=metrics)
     app.add_middleware(BrowserHeadersMiddleware)
-    for module in (webhooks, uploads, jobs, batches, health, pages):
+    for module in (webhooks, uploads, jobs, links, batches, health, pages):
         app.include_router(module.router)
     return app

@@ -160,6 +160,19 @@ class Service:
             raise ApiError(ErrorCode.not_ready, f"job {job_id} is {row.state}: it has no results")
         raise ApiError(ErrorCode.not_found, f"job {job_id} has no result {name!r}")
 
+    def link(self, caller: Caller, job_id: str, name: str) -> str:
+        """An address of a file of a succeeded job that asks for no key, for some minutes."""
+        self.result(caller.owner, job_id, name)
+        token = self.store.links.make(caller.key_id, job_id, name)
+        return f"/links/{token}/{job_id}/{quote(name)}"
+
+    def linked(self, token: str, job_id: str, name: str) -> StoredFile:
+        """The file of such an address. Whatever is wrong with it is told in the same words."""
+        owner = self.store.links.owner(token, job_id, name)
+        if owner is None:
+            raise ApiError(ErrorCode.not_found, "this link is wrong or too old; ask for a new one")
+        return self.result(owner, job_id, name)
+
     def live(self, owner: str, job_id: str) -> LiveView:
         """What the job's texture looks like now."""
         record = self._live_record(owner, job_id)

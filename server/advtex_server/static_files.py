@@ -15,6 +15,8 @@ from pathlib import Path
 from starlette.requests import Request
 from starlette.responses import Response
 
+import advtex_viewer
+
 FOLDER = Path(__file__).parent / "static"
 SUFFIXES = frozenset({".css", ".js", ".svg"})
 FOREVER = "public, max-age=31536000, immutable"
@@ -32,9 +34,13 @@ class StaticFile:
 
 @functools.cache
 def static_files() -> dict[str, Path]:
-    """All that may be asked for, by name below the folder."""
-    paths = sorted(path for path in FOLDER.rglob("*") if path.suffix in SUFFIXES)
-    return {path.relative_to(FOLDER).as_posix(): path for path in paths}
+    """All that may be asked for, by name: the page's own files, and those of the viewer as if they lay beside them."""
+    return {
+        path.relative_to(folder).as_posix(): path
+        for folder in (FOLDER, advtex_viewer.FOLDER)
+        for path in sorted(folder.rglob("*"))
+        if path.suffix in SUFFIXES
+    }
 
 
 @functools.cache

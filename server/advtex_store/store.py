@@ -11,6 +11,7 @@ from advtex_store.checks import Checks
 from advtex_store.counters import Counters
 from advtex_store.database import Database
 from advtex_store.fleet import Fleet
+from advtex_store.links import Links
 from advtex_store.live import Live
 from advtex_store.live_progress import LiveProgress
 from advtex_store.overviews import Overviews
@@ -39,6 +40,7 @@ class Store:
     submissions: Submissions
     accounts: Accounts
     sessions: Sessions
+    links: Links
     overviews: Overviews
     batches: Batches
     blobs: Blobs
@@ -75,6 +77,7 @@ def open_store(settings: StoreSettings) -> Store:
         submissions=Submissions(database, retention_seconds=retention),
         accounts=Accounts(database),
         sessions=Sessions(database),
+        links=Links(database),
         overviews=Overviews(database),
         batches=Batches(database),
         blobs=blobs,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import cv2
 import numpy as np
@@ -15,10 +16,12 @@ from lumigraph import blended, photographed_scene, photographs
 from playwright.sync_api import Page, sync_playwright
 
 from advtex_engine.core.cameras import camera_to_world
-from advtex_engine.core.scene import Camera
+from advtex_engine.core.scene import TO_Y_UP, Camera
+from advtex_engine.mesh.trim import in_box
 from advtex_engine.results import export_model
 from advtex_engine.results.photographs import photograph_stream
-from advtex_server.static_files import FOLDER
+from advtex_options.box import parse_box
+from advtex_viewer import FOLDER
 
 pytestmark = pytest.mark.slow
 DRAW = """async ({ views, place }) => {
@@ -76,6 +79,44 @@ def test_the_browser_blends_photographs_as_torch_does(
     difference = np.abs(found - wanted).max(2)
     assert np.median(difference) < 0.01
     assert (difference > 0.06).mean() < 0.03, "other pixels are at edges, where rasterizers differ"
+
+
+INSIDE = """async ({ points, box, rotations }) => {
+    const { parseBox, placed, scanToGlb, shareKept } = await import("/box.js");
+    const { rotated } = await import("/cameras.js");
+    return rotations.map((rotation) => {
+        const toGlb = scanToGlb(rotation);
+        const place = placed(parseBox(box), toGlb);
+        return points.map((point) => shareKept({ positions: rotated(toGlb, point), indices: [0, 0, 0] }, place) === 1);
+    });
+}"""
+
+
+def test_the_page_crops_what_the_engine_crops(page: Page) -> None:
+    """Whichever axis is up, on points of the scan's world."""
+    points = torch.from_numpy(np.random.default_rng(0).uniform(-2, 2, (300, 3)))
+    box = "0.3,-0.2,0.1,1,2,3,30"
+    inside = page.evaluate(INSIDE, {"points": points.tolist(), "box": box, "rotations": list(TO_Y_UP.values())})
+    wanted = [in_box(points, parse_box(box), up_axis).tolist() for up_axis in TO_Y_UP]
+    assert inside == wanted
+    assert wanted[0] != wanted[1], "the turn's sense is told apart"
+
+
+def test_scene_viewer_is_given_the_whole_address_of_a_link(page: Page) -> None:
+    intent = page.evaluate(
+        """import("/viewer.js").then(({ sceneViewer }) => sceneViewer("/links/a.1.b/c/model.glb"))"""
+    )
+    place, _, app = intent.partition("#Intent;")
+    assert urlsplit(place)[:3] == ("intent", "arvr.google.com", "/scene-viewer/1.0")
+    assert parse_qs(urlsplit(place).query) == {
+        "file": ["http://page/links/a.1.b/c/model.glb"],
+        "mode": ["ar_preferred"],
+        "resizable": ["false"],
+    }
+    told = dict(part.split("=", 1) for part in app.removesuffix(";end;").split(";"))
+    assert told["scheme"] == "https"
+    assert told["package"] == "com.google.android.googlequicksearchbox"
+    assert told["S.browser_fallback_url"] == "http%3A%2F%2Fpage%2F"
 
 
 def decoded(jpeg: bytes) -> torch.Tensor:

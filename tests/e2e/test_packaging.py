@@ -311,8 +311,8 @@ class TestDemo:
             assert demo.wait(60) == 0, "".join(said)
         assert len(processes) > 5
         wait_until(lambda: not any(psutil.pid_exists(pid) for pid in processes))
-        paths = [folder / line.split()[-1] for line in said[-4:]]
-        names = ["model.glb", "model.obj", "index.html", "comparison.png"]
+        paths = [folder / line.split()[-1] for line in said[-6:]]
+        names = ["model.glb", "model_mobile.glb", "model.usdz", "model.obj", "index.html", "comparison.png"]
         assert [path.name for path in paths] == names, "".join(said)
         assert all(path.stat().st_size > 50 for path in paths)
         assert sorted(path.name for path in (folder / "demo").iterdir()) == ["result", "service.log"]

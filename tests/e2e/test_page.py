@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import re
 import shutil
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from sqlalchemy import delete
 
 from advtex_contract.jobs import TERMINAL, JobSpec
@@ -165,6 +167,7 @@ def test_from_upload_through_a_broken_line_to_the_model(web: Browsing, archive: 
         assert hashlib.sha256(stored).digest() == hashlib.sha256(data).digest()
         page.set_default_timeout(VIEWER_MS)
         check_result(page, web, axe)
+        check_crop(page, web, job, axe)
         web.close_pages()
 
 
@@ -238,6 +241,82 @@ def check_tools(page: Page) -> None:
     expect(wipe).to_be_hidden()
     photographs.click()
     expect(page.locator(".lumigraph")).to_be_hidden()
+
+
+BOX_SEEN = """() => {
+    const viewer = document.querySelector("model-viewer");
+    const { theta, phi, radius } = viewer.getCameraOrbit();
+    const { x, y, z } = viewer.getCameraTarget();
+    const { clientWidth: width, clientHeight: height } = document.querySelector(".stage");
+    const numbers = (line, names) => names.map((name) => Number(line.getAttribute(name)));
+    const lines = [...document.querySelectorAll(".box line")];
+    const ends = lines.flatMap((line) => [numbers(line, ["x1", "y1"]), numbers(line, ["x2", "y2"])]);
+    const [field, orientation] = [viewer.getFieldOfView(), viewer.getAttribute("orientation")];
+    return { theta, phi, radius, target: [x, y, z], field, width, height, ends, orientation };
+}"""
+
+
+def check_crop(page: Page, web: Browsing, job: str, axe: str) -> None:
+    """A box is pulled, pushed by keys and typed; the job that is made of it has that box, as it is drawn, to a
+    millimetre, and else the same scan and options."""
+    page.get_by_role("button", name="Crop", exact=True).click()
+    side = page.get_by_role("button", name="Side of most X")
+    page.locator(".stage").evaluate("stage => stage.scrollIntoView({ block: 'center' })")
+    side.hover()  # waits until it stands still
+    before = numbers(page)
+    grip = side.bounding_box()
+    middle = page.get_by_role("button", name="Middle of the box").bounding_box()
+    assert grip is not None
+    assert middle is not None
+    page.mouse.down()
+    page.mouse.move((grip["x"] + middle["x"]) / 2 + 15, (grip["y"] + middle["y"]) / 2 + 15, steps=3)
+    page.mouse.up()
+    pulled = numbers(page)
+    assert pulled[3] == pytest.approx(0.75 * before[3], abs=0.1)  # less, as what is nearer looks larger
+    assert pulled[0] == pytest.approx(before[0] - (before[3] - pulled[3]) / 2, abs=0.0011)
+    page.get_by_role("button", name="Side of most Z").press("Shift+ArrowUp")
+    page.get_by_role("button", name="Turn of the box").press("Shift+ArrowRight")
+    page.get_by_label("Center Y, m").fill("0.123")
+    page.get_by_label("Center Y, m").press("Enter")
+    box = numbers(page)
+    assert box == pytest.approx([pulled[0], 0.123, pulled[2] + 0.05, *pulled[3:5], pulled[5] + 0.1, 10])
+    drawn = page.evaluate(BOX_SEEN)
+    assert np.abs(np.array(drawn["ends"]) - edges_of(box, drawn)).max() < 0.1, "a millimetre is .2 pixels"
+    expect(page.get_by_text(re.compile(r"Keeps 100\.0 % of the model's faces"))).to_be_visible()
+    look(page, "crop", web.pictures, axe)
+    page.get_by_role("button", name="Texture again with this box").click()
+    page.wait_for_url(lambda url: job not in url)
+    with web.service.client() as client:
+        old, new = client.get_job(job), client.get_job(id_of(page))
+    assert [float(part) for part in (new.options.box or "").split(",")] == pytest.approx(box, abs=1e-9)
+    assert new.upload_id == old.upload_id
+    assert new.options.model_copy(update={"box": None}) == old.options
+    state(page, "succeeded")
+
+
+def numbers(page: Page) -> list[float]:
+    """Center, size and turn, as the fields have them."""
+    return [float(field.input_value()) for field in page.locator(".numbers input").all()]
+
+
+def edges_of(box: list[float], drawn: dict[str, Any]) -> Any:
+    """[24,2] pixels, where the ends of a box's edges are seen. The scan's z is up."""
+    yaw = math.radians(box[6])
+    turn = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
+    signs = np.array([[(1 if index >> axis & 1 else -1) for axis in range(3)] for index in range(8)])
+    corners = np.array(box[:3]) + (signs * np.array(box[3:6]) / 2) @ turn.T
+    as_glb = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    angles = [float(angle.removesuffix("rad")) for angle in drawn["orientation"].split()]
+    stand = trimesh.transformations.euler_matrix(*angles, "szxy")[:3, :3]
+    theta, phi = drawn["theta"], drawn["phi"]
+    back = np.array([math.sin(phi) * math.sin(theta), math.cos(phi), math.sin(phi) * math.cos(theta)])
+    right = np.array([math.cos(theta), 0, -math.sin(theta)])
+    axes = np.stack((right, -np.cross(back, right), -back))
+    seen = (corners @ (stand @ as_glb).T - drawn["target"] - drawn["radius"] * back) @ axes.T
+    focal = drawn["height"] / 2 / math.tan(math.radians(drawn["field"]) / 2)
+    pixels = seen[:, :2] / seen[:, 2:] * focal + np.array([drawn["width"], drawn["height"]]) / 2
+    pairs = [(index, index | bit) for index in range(8) for bit in (1, 2, 4) if not index & bit]
+    return pixels[np.array(pairs).ravel()]
 
 
 def wait_until(page: Page, holds: Callable[[], bool], problem: str) -> None:

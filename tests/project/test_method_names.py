@@ -14,7 +14,9 @@ from advtex_options.methods import BUILT_IN
 ROOT = Path(__file__).parents[2]
 RECORDS = ROOT / "client" / "advtex_options" / "methods.py"
 SOURCES = [path for room in ("client", "server", "worker") for path in sorted((ROOT / room).rglob("*.py"))]
-SCRIPTS = [path for path in sorted((ROOT / "server").rglob("*.js")) if "vendor" not in path.parts]
+SCRIPTS = [
+    path for room in ("client", "server") for path in sorted((ROOT / room).rglob("*.js")) if "vendor" not in path.parts
+]
 NAMES = {method.name for method in BUILT_IN}
 STARTS = {name[:length] for name in NAMES for length in range(3, len(name) + 1)}
 IN_SCRIPT = re.compile(rf"""[!=]==?\s*["'`](?:{"|".join(NAMES)})["'`]|["'`](?:{"|".join(NAMES)})["'`]\s*[!=]==?""")

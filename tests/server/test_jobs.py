@@ -310,6 +310,30 @@ def test_if_range(live: Any, result: tuple[str, bytes]) -> None:
     assert (changed.status_code, changed.content) == (200, data)
 
 
+@pytest.mark.one_machine("tests/store has links on both databases")
+def test_a_link_gives_one_file_to_whoever_has_it(live: Any, result: tuple[str, bytes], is_error: Any) -> None:
+    url, data = result
+    made = live.http.post(url.replace("/results/", "/links/"))
+    assert made.status_code == 201
+    link = made.json()["url"]
+    with live.client(None) as anybody, live.client(live.store.accounts.create_key("other")) as other:
+        assert anybody.get(link).content == data
+        part = anybody.get(link, headers={"Range": "bytes=1-3"})
+        assert (part.status_code, part.content, part.headers["content-type"]) == (206, data[1:4], "model/gltf-binary")
+        is_error(anybody.get(url), 401, "unauthorized")
+        for wrong in (
+            link.replace("model.glb", "report.json"),
+            link[:8] + "x" + link[9:],
+            link.replace("/links/", "/links/."),
+        ):
+            is_error(anybody.get(wrong), 404, "not_found")
+        is_error(anybody.post(url.replace("/results/", "/links/")), 401, "unauthorized")
+        is_error(other.post(url.replace("/results/", "/links/")), 404, "not_found")
+        is_error(live.http.post(url.replace("/results/model", "/links/no")), 404, "not_found")
+        assert live.http.delete(url.partition("/results")[0]).status_code == 204
+        is_error(anybody.get(link), 404, "not_found")
+
+
 def test_results_of_an_unfinished_job(live: Any, scan_zip: Path, is_error: Any) -> None:
     job = live.job(live.upload(scan_zip.read_bytes()))["id"]
     is_error(live.http.get(f"/v1/jobs/{job}/results/model.glb"), 409, "not_ready")

@@ -15,6 +15,7 @@ from typing import Any
 import httpx
 import pytest
 
+import advtex_viewer
 from advtex_contract.errors import JOB_EXPLANATIONS, ErrorCode
 from advtex_contract.jobs import RETRYABLE, STATES, TERMINAL, JobError
 from advtex_contract.options import JobOptions
@@ -318,8 +319,9 @@ def test_the_catalogue_has_all_that_a_job_can_end_with() -> None:
     assert told <= set(JOB_EXPLANATIONS)
 
 
-def test_vendored_files_are_what_the_list_says() -> None:
-    folder = static_files.FOLDER / "vendor"
+@pytest.mark.parametrize("folder", [static_files.FOLDER, advtex_viewer.FOLDER], ids=["page", "viewer"])
+def test_vendored_files_are_what_the_list_says(folder: Path) -> None:
+    folder = folder / "vendor"
     listed = dict(
         re.findall(r"^\| `([\w.-]+)` .* `([0-9a-f]{64})` \|$", (folder / "VENDORED.md").read_text(), re.MULTILINE)
     )

@@ -16,6 +16,7 @@ from advtex_engine.atlas import ChartMaker, MeshPreparation, begin_charts, chart
 from advtex_engine.budget import Budget
 from advtex_engine.conventions import checked_conventions
 from advtex_engine.core import Diverged, Monitor, TextureConfig, WarningKeeper
+from advtex_engine.core.scene import Mesh
 from advtex_engine.ingest import FrameStore, read_capture
 from advtex_engine.mesh import MAX_FRAMES, fuse, register_mesh
 from advtex_engine.methods import require, texture_function
@@ -128,7 +129,7 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
     }
     report = assembled(config, given.preset, budget.device, budget.monitor.warnings, parts)
     files += (write_report(out, report),)
-    return RunResult((*files, write_page(out, report, files)), report)
+    return RunResult((*files, *write_page(out, report, files)), report)
 
 
 def _scene(
@@ -154,12 +155,15 @@ def _scene(
                 fused, made["fusion"] = fuse(capture.measured(), device, monitor)
             preparation.begin(fused, up_axis=capture.up_axis)
         with stages.run("geometry"):
-            mesh, made["mesh"] = preparation.result(monitor)
+            frames = [] if capture.mesh_refinement == "none" else capture.measured(MAX_FRAMES)
+
+            def onto_depth(mesh: Mesh) -> Mesh:
+                with_scale = capture.mesh_refinement == "scaled"
+                mesh, made["registration"] = register_mesh(mesh, frames, with_scale=with_scale)
+                return mesh
+
+            mesh, made["mesh"] = preparation.result(monitor, onto_depth if frames else None)
             capture, made["view_choice"] = capture.choose(mesh, config.max_views, monitor)
             scene = capture.scene(mesh, monitor)
-            if capture.mesh_refinement != "none" and (frames := capture.measured(MAX_FRAMES)):
-                with_scale = capture.mesh_refinement == "scaled"
-                mesh, made["registration"] = register_mesh(scene.mesh, frames, with_scale=with_scale)
-                scene = replace(scene, mesh=mesh)
             begin_charts(scene.mesh, charts)
     return scene, made

@@ -17,7 +17,9 @@ from advtex_server.deps import Reader, TheService, Writer
 from advtex_server.events import stream_events
 from advtex_server.ranges import chosen_range
 from advtex_server.refusal import WITH_KEY, refuses
+from advtex_server.service import Service
 from advtex_server.streams import while_welcome
+from advtex_store.results import StoredFile
 from advtex_store.submissions import JobFilter
 
 P = ParamSpec("P")
@@ -191,7 +193,11 @@ def get_result(
     if_none_match: Annotated[str, Header()] = "",
 ) -> Response:
     """A result file, whole or in part. Its ETag is its SHA-256."""
-    file = service.result(caller.owner, job_id, name)
+    return sent(service, service.result(caller.owner, job_id, name), range_, if_range, if_none_match)
+
+
+def sent(service: Service, file: StoredFile, range_: str, if_range: str, if_none_match: str) -> Response:
+    """The file as these headers of the request ask for it."""
     etag = f'"{file.sha256}"'
     headers = {"ETag": etag, "Accept-Ranges": "bytes", "Cache-Control": "private, no-cache"}
     if etag in [tag.strip().removeprefix("W/") for tag in if_none_match.split(",")]:

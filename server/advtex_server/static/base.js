@@ -1,5 +1,8 @@
 // What all pages share: calls of the API, streams that come back by themselves, words for numbers, elements.
 
+import { el } from "./element.js";
+
+export { el };
 export const data = JSON.parse(document.getElementById("data").textContent);
 // The words of states and stages, in their order: `STATES` and `STAGE_LABELS` of the contract; the method of who names none.
 const { states, stages, usual_method: usualMethod } = JSON.parse(document.getElementById("words").textContent);
@@ -15,19 +18,6 @@ export class CallError extends Error {
     this.status = status;
     this.details = body.details;
   }
-}
-
-/** An element; properties as they are, `class`, `aria-…` and `data-…` as attributes. Text never becomes markup. */
-export function el(tag, properties = {}, ...children) {
-  const element = tag.startsWith("svg:")
-    ? document.createElementNS("http://www.w3.org/2000/svg", tag.slice(4)) : document.createElement(tag);
-  for (const [name, value] of Object.entries(properties)) {
-    if (value === false || value == null) continue;
-    if (name in element && !name.includes("-") && !tag.startsWith("svg:")) element[name] = value;
-    else element.setAttribute(name, value);
-  }
-  element.append(...children.flat().filter((child) => child != null && child !== false));
-  return element;
 }
 
 /** Calls the API. An ended session leads to the sign-in page, unless `stay`. */
@@ -83,6 +73,9 @@ export function follow(address, handlers) {
     source?.close();
   };
 }
+
+/** What no other request has: a key by which the server knows one that is sent again. */
+export const token = () => Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, "0")).join("");
 
 export function notice(...content) {
   const place = document.getElementById("notice");

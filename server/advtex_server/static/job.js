@@ -18,6 +18,7 @@ function showHeading() {
     options.holdout && `every ${options.holdout}th frame held out`, job.attempt > 1 && `attempt ${job.attempt}`];
   byId("facts").replaceChildren(facts.filter(Boolean).join(" · "), " · ", moment(job.created_at),
     job.batch ? " · batch " : "", job.batch ? el("a", { href: `/?batch=${encodeURIComponent(job.batch)}` }, job.batch) : "",
+    job.deadline ? " · due " : "", job.deadline ? moment(job.deadline) : "",
     job.expires_at ? " · kept until " : "", job.expires_at ? moment(job.expires_at) : "");
   document.title = `${job.state === "succeeded" ? "" : `${job.state}: `}${job.label || "Job"} · advtex`;
   const ended = TERMINAL.includes(job.state);
@@ -64,15 +65,25 @@ function ending() {
   ];
 }
 
+/** Of its deadline: whether it was missed, or will be at the pace of this moment. */
+function lateness() {
+  if (!job.deadline) return null;
+  const left = (new Date(job.deadline) - Date.now()) / 1000;
+  const ended = TERMINAL.includes(job.state);
+  if (job.late || (!ended && left < 0)) return ended ? "ended after its deadline" : "late: its deadline has passed";
+  return !ended && job.progress.eta_seconds > left ? `will be late by about ${duration(job.progress.eta_seconds - left)}` : null;
+}
+
 function showNow() {
   const took = job.finished_at && (new Date(job.finished_at) - new Date(job.created_at)) / 1000;
   const waits = job.waiting_reason && el("p", {}, `Waits: ${job.waiting_reason}`);
   const memory = !TERMINAL.includes(job.state) && job.memory_bytes ? `needs about ${bytes(job.memory_bytes)} of memory` : "";
   const aside = job.state === "succeeded" ? `done in ${duration(took)}` : memory;
+  const late = lateness();
   const section = byId("now");
   section.classList.add("now");
   section.replaceChildren(
-    el("div", { class: "line" }, badge(job.state), el("span", { class: "hint" }, aside)),
+    el("div", { class: "line" }, el("span", { class: "actions" }, badge(job.state), late && el("span", { class: "badge warn" }, late)), el("span", { class: "hint" }, aside)),
     ...[waits, job.state === "running" && running(), ending()].flat().filter(Boolean));
 }
 

@@ -85,7 +85,7 @@ function showBatches(batches) {
   const place = document.getElementById("batches");
   place.hidden = !batches.length || Boolean(data.filter.batch);
   place.replaceChildren(...batches.map((batch) => el("a", { href: `/?batch=${encodeURIComponent(batch.id)}` },
-    el("strong", {}, batch.id), share(batch), el("span", { class: "hint" }, counts(batch)))));
+    el("strong", {}, batch.id), share(batch), el("span", { class: "hint" }, counts(batch), batch.paused && !batch.finished && "; paused"))));
 }
 
 function showBatch(batch) {

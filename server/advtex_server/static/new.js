@@ -1,6 +1,6 @@
 // Submit a scan: choose it, look at it, send it in pieces that survive a broken line, and make the job.
 
-import { CallError, bytes, call, count, data, duration, el, findings, notice } from "./base.js";
+import { CallError, bytes, call, count, data, duration, el, findings, notice, token } from "./base.js";
 import { inspected } from "./inspect.js";
 import { zipDirectory, zipped } from "./zip.js";
 
@@ -162,7 +162,7 @@ async function submit() {
   const uploadId = await send(body, scan.file ? scan.name : `${scan.name}.zip`, fingerprint);
   byId("pause").hidden = byId("abandon").hidden = true;
   say("Everything is sent. The server looks into the files …", 1);
-  let job = await call("POST", "/v1/jobs", { body: spec(uploadId), headers: { "Idempotency-Key": key() }, stay: true });
+  let job = await call("POST", "/v1/jobs", { body: spec(uploadId), headers: { "Idempotency-Key": token() }, stay: true });
   while (job.state === "checking") {
     await new Promise((resolve) => setTimeout(resolve, CHECK_MS));
     job = await call("GET", `/v1/jobs/${job.id}`, { stay: true });
@@ -176,8 +176,6 @@ async function submit() {
     el("a", { href: `/jobs/${job.id}` }, "The job that was rejected")));
   byId("chosen").scrollIntoView({ block: "center" });
 }
-
-const key = () => Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, "0")).join("");
 
 async function start(event) {
   event.preventDefault();

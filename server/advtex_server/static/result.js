@@ -1,7 +1,8 @@
 // What a finished job is: the model, its files, what the report says.
 
+import { textureAgain } from "./again.js";
 import { showAtlas } from "./atlas.js";
-import { bytes, count, duration, el, findings, stageName } from "./base.js";
+import { bytes, call, count, duration, el, findings, stageName } from "./base.js";
 import { showComparison } from "./compare.js";
 import { showCurves } from "./chart.js";
 import { showModel } from "./viewer.js";
@@ -37,7 +38,10 @@ export async function showResult(job) {
   showDownloads(job.results);
   const [manifest, report] = await Promise.all([
     loaded(address("previews/manifest.json")).catch(() => null), loaded(address("report.json")).catch(() => null)]);
-  showModel(byId("model"), manifest, address);
+  showModel(byId("model"), manifest, address, {
+    box: job.options.box, send: (box) => textureAgain(job, box),
+    link: async (name) => (await call("POST", `/v1/jobs/${job.id}/links/${name}`)).url,
+  });
   if (manifest) {
     showComparison(byId("compare"), manifest.views ?? [], address);
     showAtlas(byId("atlas"), manifest.atlas ?? [], address);

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -132,16 +133,23 @@ def test_a_placed_model_is_moved_onto_the_depth_where_that_is_asked_for(
         assert off > 0.003
 
 
-def test_a_model_that_was_placed_further_off_is_moved_too(exact: Path, tmp_path: Path) -> None:
-    """So far that most of the depth is more than 5 % off: that speaks against the place, not against the depth."""
+def test_a_model_that_was_placed_further_off_is_moved_too_and_then_cropped(exact: Path, tmp_path: Path) -> None:
+    """So far that most of the depth is more than 5 % off: that speaks against the place, not against the depth. The box
+    is one of the world of the result."""
     placed = trimesh.transformations.translation_matrix((0.03, -0.02, 0.02))
     placed = placed @ trimesh.transformations.rotation_matrix(math.radians(8), (0.3, 0.5, 1))
     scan = variant(exact, tmp_path, {"mesh_to_world": placed.tolist(), "mesh_refinement": "rigid"})
-    report = texture_scan(scan, tmp_path / "out", CONFIG, work=tmp_path / "work").report
+    truth, _ = load_model(exact / "truth" / "object.obj")
+    bounds = torch.stack((truth.mesh.v_pos.amin(0), truth.mesh.v_pos.amax(0)))
+    border = float(bounds[:, 0].mean())
+    config = replace(CONFIG, box=f"{border - 1},0,0,2,9,9")  # the half of it that has less x
+    report = texture_scan(scan, tmp_path / "out", config, work=tmp_path / "work").report
     assert report["registration"]["accepted"]
     assert [warning["code"] for warning in report["warnings"]] == []
     model, _ = load_model(tmp_path / "out" / "model.obj")
-    truth, _ = load_model(exact / "truth" / "object.obj")
+    middles = model.mesh.v_pos[model.mesh.t_pos_idx].mean(1)[:, 0]
+    assert border - 0.005 < float(middles.amax()) < border + 0.001
+    assert float(middles.amin()) == pytest.approx(float(bounds[0, 0]), abs=0.01)
     assert float(distances(spread_points(model.mesh, 800), truth.mesh).median()) < 0.001
 
 

@@ -18,9 +18,10 @@ import pytest
 import torch
 import trimesh
 from atlases import of_trimesh
-from browsing import chromium
+from browsing import FLAGS, chromium
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from playwright.sync_api import Page as Tab
 from playwright.sync_api import sync_playwright
 from torch import Tensor
 
@@ -40,6 +41,7 @@ from advtex_engine.render.pairs import related_pairs
 from advtex_engine.render.render_view import render_view
 from advtex_engine.render.view_maps import ViewMaps, build_view_maps
 from advtex_engine.results import seen as seen_module
+from advtex_engine.results.export import export_model
 from advtex_engine.results.gallery import MAX_VIEWS, chosen_views, write_gallery
 from advtex_engine.results.initial_view import orbit
 from advtex_engine.results.result_page import embedded, write_page
@@ -47,6 +49,7 @@ from advtex_engine.results.seen import write_seen
 
 HOSTILE = "</script><script>document.title='taken'</script>&lt;img src=x onerror=alert(1)>\u2028.png"
 SIDE = 64
+VIEWER_MS = 60_000  # Chromium draws without a GPU
 
 
 SHOWN = ("#frame", "#under", "#over", "#atlas img")
@@ -101,7 +104,9 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Scene, Atlas
     out = tmp_path_factory.mktemp("result")
     made, atlas = scene()
     history = curves([{"step": 1, "l1": 0.5}, {"step": 2, "l1": math.nan}], [{"step": 2, "psnr": 30.0}])
-    return out, made, atlas, write_gallery(out, made, atlas, texture(), texture(1), history, STATE)
+    files = write_gallery(out, made, atlas, texture(), texture(1), history, STATE)
+    export_model(out, atlas, texture(), up_axis=made.up_axis)
+    return out, made, atlas, files
 
 
 def test_what_is_not_seen_has_colors_of_its_own(result: tuple[Path, Scene, Atlas, tuple[Path, ...]]) -> None:
@@ -200,7 +205,7 @@ def page_of(out: Path, name: str, files: tuple[Path, ...]) -> tuple[Page, str]:
     report = {
         "scan": scan,
         "atlas": {"width": SIDE, "height": SIDE},
-        "options": {"method": name, "preset": name},
+        "options": {"method": name, "preset": name, "box": None},
         "device": "cpu",
         "stages": [stage],
         "warnings": [warning],
@@ -209,7 +214,7 @@ def page_of(out: Path, name: str, files: tuple[Path, ...]) -> tuple[Page, str]:
         "surface": {"seen": 0.5, "guessed": 0.125, "unseen": 0.375},
         "losses": [1],
     }
-    text = write_page(out, report, files).read_text()
+    text = write_page(out, report, files)[-1].read_text()
     page = Page()
     page.feed(text)
     return page, text
@@ -236,11 +241,12 @@ def test_the_page_opens_from_disk_and_runs_no_name(result: tuple[Path, Scene, At
     page_of(out, HOSTILE, files)
     problems = list[str]()
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
+        browser = playwright.chromium.launch(executable_path=chromium(), args=FLAGS)
         tab = browser.new_page()
         tab.on("pageerror", lambda error: problems.append(str(error)))
         tab.on("requestfailed", lambda request: problems.append(request.url))
-        tab.on("request", lambda request: None if request.url.startswith("file:") else problems.append(request.url))
+        own = ("file:", "blob:null/")
+        tab.on("request", lambda request: None if request.url.startswith(own) else problems.append(request.url))
         tab.goto((out / "index.html").as_uri())
         assert tab.title() == "Textured model"
         view = tab.get_by_label("View")
@@ -269,8 +275,29 @@ def test_the_page_opens_from_disk_and_runs_no_name(result: tuple[Path, Scene, At
         assert shown["#under"].endswith("_seen.jpg")
         assert shown["#atlas img"].endswith("atlas_0_seen.jpg")
         assert shown["#over"].endswith("_photo.jpg")
+        check_solid(tab)
         browser.close()
     assert problems == []
+
+
+def check_solid(tab: Tab) -> None:
+    """The page's tools on the model in 3D, all of them made of what lies beside index.html."""
+    tab.get_by_role("button", name="Show the model").click()
+    tab.get_by_label("Compare with").select_option(index=1, timeout=VIEWER_MS)
+    tab.get_by_role("slider", name="Photograph against model").wait_for()
+    assert tab.locator(".wipe img").evaluate("image => image.naturalWidth") == 96
+    tab.get_by_role("button", name="Measure").click()
+    viewer = tab.locator("model-viewer").bounding_box()
+    assert viewer is not None
+    for aside in (-20, 20):
+        tab.mouse.click(viewer["x"] + viewer["width"] / 2 + aside, viewer["y"] + viewer["height"] / 2)
+    tab.get_by_text("Distance: ").wait_for()
+    tab.get_by_role("button", name="Photographs where you stand").click()
+    tab.locator(".lumigraph").wait_for()
+    tab.get_by_role("button", name="Crop").click()
+    tab.get_by_text("--box=0,0,0,2.002,1.602,1.202,0", exact=True).wait_for()
+    assert not tab.get_by_role("button", name="Texture again").count(), "there is no server"
+    assert tab.locator("#trouble").inner_text() == ""
 
 
 @given(st.dictionaries(st.text(), st.lists(st.text() | st.integers() | st.none(), max_size=3), max_size=3))

@@ -11,28 +11,30 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+from advtex_engine.results.viewer_files import write_viewer
 from advtex_engine.runtime.files import json_text, write_atomically
 
 TEMPLATE = Path(__file__).with_name("result_page.html")
 LEFT_OUT = ("losses",)  # of the report: the curves have them
 
 
-def write_page(out: Path, report: Mapping[str, Any], files: Sequence[Path]) -> Path:
-    """Writes index.html beside the manifest and curves that `gallery.write_gallery` left below `out`.
+def write_page(out: Path, report: Mapping[str, Any], files: Sequence[Path]) -> tuple[Path, ...]:
+    """Writes index.html, and what it shows the model in 3D with, beside what `export_model` and `write_gallery` left.
 
-    files: the result's; those at its root are linked.
+    files: the result's; those at its root are linked. -> the paths, that of the page last.
     """
-    previews = out / "previews"
+    previews, viewer = out / "previews", write_viewer(out)
     data = {
         "manifest": json.loads((previews / "manifest.json").read_bytes()),
         "curves": json.loads((previews / "curves.json").read_bytes()),
         "report": {name: part for name, part in report.items() if name not in LEFT_OUT},
         "files": [file.name for file in files if file.parent == out],
+        "viewer": {file.name: file.stat().st_size for file in viewer},
     }
     page = Template(TEMPLATE.read_text(encoding="utf-8")).substitute(data=embedded(data))
     path = out / "index.html"
     write_atomically(path, page.encode())
-    return path
+    return *viewer, path
 
 
 def embedded(data: object) -> str:

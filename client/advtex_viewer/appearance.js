@@ -1,6 +1,6 @@
 // How the model looks: its light, what lies behind it, and what of its texture was seen.
 
-import { el } from "./base.js";
+import { el } from "./element.js";
 
 const LIGHTS = { photographed: "As photographed", studio: "Studio light" };
 const BACKGROUNDS = { page: "As the page", light: "Light", gray: "Gray", dark: "Dark" };

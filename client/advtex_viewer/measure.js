@@ -1,6 +1,6 @@
 // The distance between two points of the model's surface that are picked on the viewer.
 
-import { el } from "./base.js";
+import { el } from "./element.js";
 
 const DRAGGED = 5; // pixels: a pointer that moved so far turned the model and picks nothing
 

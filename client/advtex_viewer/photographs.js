@@ -1,7 +1,7 @@
 // Photographs in 3D: one laid over the model at its own camera, and those from where the viewer stands blended onto the surface.
 
 import { choice } from "./appearance.js";
-import { el } from "./base.js";
+import { el } from "./element.js";
 import { dot, minus, orbitOf, photographCamera, rotated, transposed, viewerCamera } from "./cameras.js";
 import { triangles } from "./glb.js";
 import { Lumigraph } from "./lumigraph.js";

@@ -4,6 +4,7 @@
 // no photograph was taken from about there, so that the model below shows. tests/support/lumigraph.py renders the same without a GPU.
 
 import { clipMatrix, dot, minus, rotated } from "./cameras.js";
+import { linked, uploaded } from "./meshes.js";
 
 const LIMIT = 0.7; // radians between the viewer's and the photograph's line of sight: beyond it the photograph is not used
 const FADE = 0.35; // radians over which photographs give way to the model
@@ -90,8 +91,8 @@ export class Lumigraph {
     this.cameras = photographs.map(({ camera }) => camera);
     this.samples = samplesOf(mesh);
     this.far = Math.max(...this.cameras.flatMap(({ eye }) => this.samples.map((point) => Math.hypot(...minus(point, eye))))) * 1.5 + 1;
-    this.program = this.linked(VERTEX, FRAGMENT);
-    this.upload();
+    this.program = linked(this.gl, VERTEX, FRAGMENT);
+    uploaded(this.gl, mesh);
     this.photographs = this.photographArray(photographs.map(({ picture }) => picture));
     this.depths = this.depthArray();
   }
@@ -133,32 +134,6 @@ export class Lumigraph {
     return scores.filter(([, score]) => score > 0).sort((a, b) => b[1] - a[1]).slice(0, CANDIDATES).map(([index]) => index);
   }
 
-  linked(vertex, fragment) {
-    const { gl } = this;
-    const program = gl.createProgram();
-    for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
-      const shader = gl.createShader(kind);
-      gl.shaderSource(shader, source);
-      gl.compileShader(shader);
-      gl.attachShader(program, shader);
-    }
-    gl.bindAttribLocation(program, 0, "position");
-    gl.linkProgram(program);
-    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
-    return program;
-  }
-
-  upload() {
-    const { gl, mesh } = this;
-    gl.enable(gl.DEPTH_TEST);
-    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ARRAY_BUFFER, mesh.positions, gl.STATIC_DRAW);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, mesh.indices, gl.STATIC_DRAW);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
-  }
-
   photographArray(pictures) {
     const { gl } = this;
     const [{ width, height }] = pictures;
@@ -181,7 +156,7 @@ export class Lumigraph {
     const [columns, rows] = [Math.round(width * scale), Math.round(height * scale)];
     const texture = this.array(1, 1, gl.DEPTH_COMPONENT24, columns, rows, this.cameras.length);
     for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D_ARRAY, side, gl.NEAREST);
-    const program = this.linked(DEPTH_VERTEX, DEPTH_FRAGMENT);
+    const program = linked(gl, DEPTH_VERTEX, DEPTH_FRAGMENT);
     gl.useProgram(program);
     gl.bindFramebuffer(gl.FRAMEBUFFER, gl.createFramebuffer());
     gl.viewport(0, 0, columns, rows);

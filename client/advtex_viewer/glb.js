@@ -4,7 +4,9 @@ const JSON_START = 20;
 const POSITIONS = 5126; // float32
 const INDICES = { 5123: Uint16Array, 5125: Uint32Array };
 
-/** -> {positions: Float32Array, indices: Uint32Array} in the file's world (y up). Error where the file is another kind. */
+/** -> {positions: Float32Array, indices: Uint32Array} in the file's world (y up), and the quaternion that turned them there.
+ *
+ * Error where the file is another kind. */
 export function triangles(buffer) {
   const header = new DataView(buffer);
   const length = header.getUint32(12, true);
@@ -30,7 +32,8 @@ export function triangles(buffer) {
     points += found.length;
     corners += order.length;
   }
-  return { positions: turned(positions, node.rotation ?? [0, 0, 0, 1]), indices };
+  const rotation = node.rotation ?? [0, 0, 0, 1];
+  return { positions: turned(positions, rotation), indices, rotation };
 }
 
 /** Points turned by a quaternion (x, y, z, w), in place. */

@@ -1,16 +1,19 @@
 // The model in 3D: model-viewer with what one can do there, or pictures where it cannot draw.
 
 import { backgroundChoice, lightChoice, seenChoice, setLight } from "./appearance.js";
-import { el } from "./base.js";
+import { el } from "./element.js";
 import { orientationRows } from "./cameras.js";
+import { cropping } from "./crop.js";
 import { measuring } from "./measure.js";
 import { Photographs, lumigraphButton, photographChoice } from "./photographs.js";
 
 const PATIENCE_MS = 15000;
+const SCENE_VIEWER = "intent://arvr.google.com/scene-viewer/1.0";
 const TOUCHED = matchMedia("(pointer: coarse)"); // phones and tablets: they get the small model, where there is one
 
-/** manifest: of the previews, or null. address: the URL of a result file, null if there is none. */
-export function showModel(section, manifest, address) {
+/** manifest: of the previews, or null. address: the URL of a result file, null if there is none. server: what it does, if there is one:
+ * `send` and `box` of `cropping`, and `link`, which resolves to an address of a file that needs no session. */
+export function showModel(section, manifest, address, server = {}) {
   const stage = el("div", { class: "stage" });
   section.append(stage);
   const url = (TOUCHED.matches && address("model_mobile.glb")) || address("model.glb");
@@ -32,7 +35,7 @@ export function showModel(section, manifest, address) {
     clearTimeout(late);
     wait.remove();
     setLight(viewer, "photographed");
-    section.append(tools(viewer, stage, url, manifest, address));
+    section.append(tools(viewer, stage, url, manifest, address, server));
   }, { once: true });
   function fallBack() {
     clearTimeout(late);
@@ -53,12 +56,14 @@ function start(viewer, stage, orbit) {
   viewer.setAttribute("field-of-view", `${orbit.field_of_view}deg`);
 }
 
-function tools(viewer, stage, url, manifest, address) {
+function tools(viewer, stage, url, manifest, address, server) {
   const said = el("p", { class: "hint", role: "status" });
-  const bar = el("div", { class: "toolbar tools" }, lightChoice(viewer), backgroundChoice(stage), seenChoice(viewer, seenPages(address)),
-    measuring(viewer, stage, said), arButton(viewer, address("model.usdz"), said));
-  if (manifest?.photographs && manifest.orbit) addPhotographs(bar, viewer, stage, url, manifest, address, said);
-  return el("div", {}, bar, said);
+  const stand = orientationRows(manifest?.orbit?.orientation ?? [0, 0, 0]);
+  const [button, panel] = cropping(viewer, stage, url, stand, said, server);
+  const bar = el("div", { class: "toolbar tools" }, lightChoice(viewer), backgroundChoice(stage), seenChoice(viewer, url === address("model.glb") ? seenPages(address) : []),
+    measuring(viewer, stage, said), button, arButton(viewer, url, address, server.link, said));
+  if (manifest?.photographs && manifest.orbit) addPhotographs(bar, viewer, stage, url, manifest, address, stand, said);
+  return el("div", {}, bar, said, panel);
 }
 
 function seenPages(address) {
@@ -66,18 +71,24 @@ function seenPages(address) {
   return names.map(address).filter(Boolean);
 }
 
-async function addPhotographs(bar, viewer, stage, url, { photographs, orbit }, address, said) {
+async function addPhotographs(bar, viewer, stage, url, { photographs, orbit }, address, stand, said) {
   const listed = await fetch(address(photographs)).then((answer) => (answer.ok ? answer.json() : null)).catch(() => null);
   if (!listed) return;
   const found = new Photographs(listed, address);
-  const stand = orientationRows(orbit.orientation);
   bar.append(photographChoice(viewer, stage, found, orbit, stand), lumigraphButton(viewer, stage, found, url, stand, said));
 }
 
-/** Only where it can be: WebXR takes the model that is loaded; Quick Look, which knows nothing of the session, a copy of the USDZ. */
-function arButton(viewer, usdz, said) {
-  return el("button", { type: "button", hidden: !viewer.canActivateAR, onclick: async () => {
+/** Only where it can be: WebXR takes the model that is loaded; apps know nothing of the session: Quick Look gets a copy of the USDZ,
+ * and Scene Viewer, on Android where the browser has no WebXR, a link. It takes https alone. */
+function arButton(viewer, url, address, link, said) {
+  const scene = !viewer.canActivateAR && link && /android/i.test(navigator.userAgent) && location.protocol === "https:";
+  return el("button", { type: "button", hidden: !viewer.canActivateAR && !scene, onclick: async () => {
     try {
+      if (scene) {
+        location.assign(sceneViewer(await link(url === address("model_mobile.glb") ? "model_mobile.glb" : "model.glb")));
+        return;
+      }
+      const usdz = address("model.usdz");
       if (usdz && !viewer.iosSrc && document.createElement("a").relList.supports("ar")) {
         said.textContent = "Loading the model for AR …";
         viewer.iosSrc = URL.createObjectURL(await (await fetch(usdz)).blob());
@@ -88,6 +99,13 @@ function arButton(viewer, usdz, said) {
       said.textContent = `AR cannot be started: ${error.message}`;
     }
   } }, "View in AR");
+}
+
+/** What Android opens Google's app with, or else this page again. model: the address of a GLB on this server. */
+export function sceneViewer(model) {
+  const query = new URLSearchParams({ file: new URL(model, location.href).href, mode: "ar_preferred", resizable: "false" });
+  const app = "scheme=https;package=com.google.android.googlequicksearchbox;action=android.intent.action.VIEW";
+  return `${SCENE_VIEWER}?${query}#Intent;${app};S.browser_fallback_url=${encodeURIComponent(location.href)};end;`;
 }
 
 /** Pictures from all around, and a slider that turns them. */

@@ -13,7 +13,7 @@ RUN --mount=type=cache,target=/root/.cache/pip \
     /opt/advtex/bin/pip install --constraint constraints.txt torch numpy opencv-python-headless av imagecodecs
 COPY . .
 RUN --mount=type=cache,target=/root/.cache/pip \
-    /opt/advtex/bin/pip install --constraint constraints.txt '.[worker,traces]'
+    /opt/advtex/bin/pip install --constraint constraints.txt '.[worker,draco,traces]'
 # What is installed, as CycloneDX: docker run --rm --entrypoint cat advtex-worker /opt/advtex/sbom.json
 RUN --mount=type=cache,target=/root/.cache/pip \
     python -m venv /opt/sbom \

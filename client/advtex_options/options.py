@@ -170,10 +170,14 @@ class Options:
         None,
         "which files are made beside OBJ, GLB, report and previews, with commas between",
         "Files",
-        unset="all of them",
+        unset="usdz, mobile and lod, and tiles of scenes beyond one image",
         choices=MappingProxyType({word: output.purpose for word, output in OUTPUTS.items()}),
         several=True,
-        offers=(("", "the usual, for phones and AR too"), ("glb", "OBJ and GLB only")),
+        offers=(
+            ("", "the usual, for phones and AR too"),
+            ("glb", "OBJ and GLB only"),
+            ("usdz,mobile,lod,tiles", "the usual, and 3D Tiles"),
+        ),
     )
 
 

@@ -12,25 +12,33 @@ from types import MappingProxyType
 class Output:
     """Files that are made together. patterns: of their names. purpose: of the files, in a phrase.
 
-    always: made whatever is asked for.
+    made: "always", whatever is asked for; "usually", unless others are asked for; "large", as usually, of scenes beyond
+    one image; or "asked", if they are asked for.
     """
 
     patterns: tuple[str, ...]
     purpose: str
-    always: bool = True
+    made: str = "always"
 
 
 OUTPUTS: Mapping[str, Output] = MappingProxyType(
     {
         "obj": Output(("model.obj", "model.mtl", "model*.png"), "for modeling programs: exact, images as PNG"),
         "glb": Output(("model.glb",), "for viewers and game engines: all faces and texels in one file"),
-        "usdz": Output(("model.usdz",), "for AR on iOS", always=False),
+        "usdz": Output(("model.usdz",), "for AR on iOS", "usually"),
         "mobile": Output(
-            ("model_mobile.glb",), "for phones and web pages: at most 50,000 faces, one image, 5 MB", always=False
+            ("model_mobile.glb",), "for phones and web pages: at most 50,000 faces, one image, 5 MB", "usually"
         ),
         "lod": Output(
-            ("model_lod?.glb",), "for scenes of many models: a quarter, a sixteenth of the detail", always=False
+            ("model_lod?.glb",), "for scenes of many models: a quarter, a sixteenth of the detail", "usually"
         ),
+        "tiles": Output(
+            ("model.3tz",), "for viewers of 3D Tiles: a zip of a tileset of GLB tiles under 3 MB each", "large"
+        ),
+        "draco": Output(
+            ("model_draco.glb",), "for viewers with a decoder of Draco: a fourth of the bytes of the faces", "asked"
+        ),
+        "webp": Output(("model_webp.glb",), "for viewers that take WebP: fewer bytes of the images", "asked"),
     }
 )
 """By the word for them, which is also the `kind` of the files in the API."""
@@ -46,11 +54,13 @@ REST: Mapping[str, Output] = MappingProxyType(
 """Of the same form; nobody chooses them."""
 
 
-def wanted(outputs: str | None) -> frozenset[str]:
-    """The words of what is to be made. outputs: the option of that name."""
-    if outputs is None:
-        return frozenset(OUTPUTS)
-    return frozenset(outputs.split(",")) | {word for word, output in OUTPUTS.items() if output.always}
+def wanted(outputs: str | None, *, large: bool = False) -> frozenset[str]:
+    """The words of what is to be made. outputs: the option of that name. large: the scene is beyond one image."""
+    usual = {"always", "usually", "large"} if large else {"always", "usually"}
+    made = {"always"} if outputs else usual
+    return frozenset(outputs.split(",") if outputs else ()) | {
+        word for word, one in OUTPUTS.items() if one.made in made
+    }
 
 
 def kind_and_purpose(name: str) -> tuple[str, str]:

@@ -20,6 +20,7 @@ CONTENT_TYPES = {
     ".obj": "model/obj",
     ".mtl": "model/mtl",
     ".usdz": "model/vnd.usdz+zip",
+    ".3tz": "application/vnd.maxar.archive.3tz+zip",
     ".mjpeg": "video/x-motion-jpeg",
     ".log": "text/plain",
 }

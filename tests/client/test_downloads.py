@@ -198,12 +198,15 @@ def named(*names: str) -> JobView:
         ("glb,usdz", ["model.glb", "model.usdz"]),
         ("model.mtl, mobile", ["model.mtl", "model_mobile.glb"]),
         ("obj", ["model.obj", "model.mtl", "model.png"]),
+        ("tiles,draco,webp", ["model.3tz", "model_draco.glb", "model_webp.glb"]),
+        ("3tz", ["model.3tz"]),
         ("previews", ["previews/0.jpg"]),
         ("json", ["report.json"]),
     ],
 )
 def test_files_are_chosen_by_name_kind_and_ending(words: str, found: list[str]) -> None:
     names = ("model.obj", "model.mtl", "model.png", "model.glb", "model_mobile.glb", "model.usdz")
+    names += ("model.3tz", "model_draco.glb", "model_webp.glb")
     assert only_results(named(*names, "previews/0.jpg", "report.json"), words) == found
 
 

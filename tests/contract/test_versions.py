@@ -102,7 +102,9 @@ def test_options_that_are_sent_are_refused_where_they_are_not_known() -> None:
 def test_which_files_are_made_is_a_list_of_known_words() -> None:
     assert options.chosen_options({"outputs": "usdz,mobile"}).outputs == "usdz,mobile"
     for wrong in ("fbx", "usdz,fbx", "usdz, mobile", ""):
-        with pytest.raises(ValueError, match=r"outputs .* is unknown; choose one of obj, glb, usdz, mobile, lod"):
+        with pytest.raises(
+            ValueError, match=r"outputs .* is unknown; choose one of obj, glb, usdz, mobile, lod, tiles"
+        ):
             options.chosen_options({"outputs": wrong})
         with pytest.raises(ValidationError, match="choose one of obj"):
             jobs.JobSpec.model_validate({"upload_id": "u", "options": {"outputs": wrong}})
@@ -115,6 +117,9 @@ def test_what_a_file_is_for_may_be_untold() -> None:
 
 
 def test_what_was_not_asked_for_is_left_out_but_for_what_is_always_made() -> None:
-    assert wanted(None) == set(OUTPUTS)
+    assert wanted(None) == set(OUTPUTS) - {"tiles", "draco", "webp"}
+    assert wanted(None, large=True) == set(OUTPUTS) - {"draco", "webp"}
+    assert wanted("tiles") == {"obj", "glb", "tiles"}
+    assert wanted("webp", large=True) == {"obj", "glb", "webp"}
     assert wanted("mobile") == {"obj", "glb", "mobile"}
     assert wanted("glb") == {"obj", "glb"}

@@ -106,6 +106,8 @@ def test_a_run_leaves_models_previews_and_a_report(whole: tuple[Path, Recorder])
         "previews/sheet.png",
     ):
         assert (out / name).stat().st_size > 50, name
+    for name in ("model.3tz", "model_draco.glb", "model_webp.glb"):
+        assert not (out / name).exists(), "nobody asked for it"
     manifest = json.loads((out / "previews/manifest.json").read_text())
     assert [view["heldout"] for view in manifest["views"]].count(True) == 2
     curves = json.loads((out / manifest["curves"]).read_text())
@@ -364,10 +366,12 @@ def test_a_pyramid_that_is_stopped_at_either_level_resumes_to_the_same_bytes(
 
 
 def test_the_mean_method_takes_no_steps(scan: Path, tmp_path: Path) -> None:
-    config = TextureConfig(method="mean", face_budget=4000, device="cpu", refine=False, outputs="glb")
+    config = replace(CONFIG, method="mean", refine=False, holdout=None, outputs="tiles,draco,webp")
     result = texture_scan(scan, tmp_path, config, work=tmp_path / "work", monitor=Recorder())
     assert result.report["losses"] == []
-    assert (tmp_path / "model.glb").exists()
+    asked_for = {"model.3tz", "model_draco.glb", "model_webp.glb"}
+    models = {path.name for path in result.files if path.name.startswith("model")}
+    assert models == {"model.obj", "model.mtl", "model.png", "model.glb", "model_seen.png", *asked_for}
 
 
 def test_auto_is_standard_on_a_cpu_and_full_on_a_gpu() -> None:

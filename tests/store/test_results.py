@@ -105,6 +105,7 @@ def test_a_canceled_job_is_not_brought_back(bench: Any, results: Results) -> Non
         ("a.png", "image/png"),
         ("report.json", "application/json"),
         ("engine.log", "text/plain"),
+        ("model.3tz", "application/vnd.maxar.archive.3tz+zip"),
         ("a.unknown-kind", "application/octet-stream"),
     ],
 )

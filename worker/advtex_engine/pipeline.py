@@ -27,11 +27,14 @@ from advtex_engine.results import (
     describe_scene,
     export_model,
     heldout_scores,
+    require_draco,
+    write_compressed,
     write_gallery,
     write_page,
     write_report,
     write_seen,
     write_smaller,
+    write_tiles,
 )
 from advtex_engine.runtime import Stages, WorkFolder, choose_device
 from advtex_engine.stages import (
@@ -68,6 +71,8 @@ def texture_scan(
     """
     device = choose_device(config.device)
     require(config.method)
+    if "draco" in wanted(config.outputs):
+        require_draco()
     keeper = WarningKeeper(monitor or Monitor())
     folder = WorkFolder(work, fingerprint(scan, config), keeper)
     if not resume:
@@ -102,12 +107,15 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
         atlas, completed = completed_model(atlas, texture, seen, made["mesh"]["made_up_faces"], config)
     texture = completed.texture
     with stages.run("export"):
-        outputs = wanted(config.outputs)
+        outputs = wanted(config.outputs, large=atlas.pages > 1)
         files = export_model(
             out, atlas, texture, up_axis=scene.up_axis, lossless=config.lossless, usdz="usdz" in outputs
         )
         files += write_seen(out, atlas, completed.state)
-        files += write_smaller(out, atlas, texture, outputs, up_axis=scene.up_axis)
+        files += write_smaller(out, atlas, texture, outputs, up_axis=scene.up_axis, monitor=stages.monitor)
+        files += write_compressed(out, atlas, texture, outputs, lossless=bool(config.lossless))
+        if "tiles" in outputs:
+            files += (write_tiles(out, atlas, texture, up_axis=scene.up_axis),)
     with stages.run("previews"):
         files += write_gallery(out, scene, atlas, texture, mean, curves(losses, given.live.quality), completed.state)
         atlas = replace(atlas, mesh=atlas.mesh.to(torch.device("cpu")))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,56 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from sheets import FROM_ABOVE, many_charts
 
+from advtex_engine.core.errors import Problem
 from advtex_engine.core.monitor import Monitor
-from advtex_engine.core.scene import Atlas, Camera, Mesh
+from advtex_engine.core.scene import Atlas, Mesh
 from advtex_engine.mesh.models import load_model
 from advtex_engine.render.render_view import render_view
 from advtex_engine.results import levels
 from advtex_engine.results.baking import TexturedModel, bake
 from advtex_engine.results.levels import write_smaller
-
-FROM_ABOVE = Camera(
-    torch.tensor([[110.0, 0, 64], [0, 110, 64], [0, 0, 1]], dtype=torch.float64),
-    torch.tensor([[1.0, 0, 0, -0.5], [0, -1, 0, 0.5], [0, 0, -1, 1.3], [0, 0, 0, 1]], dtype=torch.float64),
-    128,
-    128,
-)
-
-
-def many_charts(cells: int = 48, side: int = 512) -> TexturedModel:
-    """A wavy sheet facing +z in strips, each a chart of its own that lies upside down beside the one before."""
-    at = np.linspace(0, 1, cells + 1)
-    y, x = np.meshgrid(at, at, indexing="ij")
-    index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
-    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
-    faces = np.stack((np.stack((a, b, c), -1), np.stack((a, c, d), -1)), 2).reshape(-1, 3)
-    points = np.stack((x, y, 0.05 * np.sin(7 * x + 3 * y)), -1).reshape(-1, 3)
-    strips = cells // 4
-    strip = np.repeat(np.arange(cells) // 4, 2 * cells)[:, None]
-    place = strips - 1 - strip  # of the strip in the texture
-    across = points[faces, 1] * strips - strip
-    v = (place + 0.1 + 0.8 * np.where(strip % 2, across, 1 - across)) / strips
-    uv = np.stack((points[faces, 0] * 0.96 + 0.02, v), -1).reshape(-1, 2)
-    rows, columns = (np.mgrid[:side, :side] + 0.5) / side
-    there = np.floor(rows * strips)
-    within = np.clip((rows * strips - there - 0.1) / 0.8, 0, 1)
-    number = strips - 1 - there
-    height = (number + np.where(number % 2, within, 1 - within)) / strips
-    texture = painted((columns - 0.02) / 0.96, height)
-    mesh = Mesh(
-        torch.from_numpy(points.astype(np.float32)),
-        torch.from_numpy(faces),
-        torch.from_numpy(uv.astype(np.float32)),
-        torch.arange(len(uv)).view(-1, 3),
-    )
-    return TexturedModel(Atlas(mesh, side, side, "xatlas", strips), torch.from_numpy(texture))
-
-
-def painted(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Smooth colors [...,3] uint8 of the sheet's points."""
-    waves = (np.sin(9 * x + 2 * y), np.sin(8 * y - 3 * x), np.cos(11 * x * y))
-    return np.stack([np.rint(127 + 100 * wave).astype(np.uint8) for wave in waves], -1)
 
 
 def test_another_mesh_is_painted_with_what_lies_under_it_through_all_charts() -> None:
@@ -123,3 +85,58 @@ def test_nothing_is_made_that_was_not_asked_for(tmp_path: Path) -> None:
     full = many_charts(8, 64)
     assert write_smaller(tmp_path, full.atlas, full.texture, {"obj", "glb", "usdz"}, up_axis="+z") == ()
     assert list(tmp_path.iterdir()) == []
+
+
+class Told(Monitor):
+    def __init__(self) -> None:
+        self.problems = list[Problem]()
+
+    def warning(self, problem: Problem) -> None:
+        self.problems.append(problem)
+
+
+def loose_pieces(count: int, side: int) -> TexturedModel:
+    """Triangles here and there that touch no other, each with its own place in the texture."""
+    rng = np.random.default_rng(0)
+    points = (rng.random((count, 1, 3)) * 4 + 0.01 * rng.standard_normal((count, 3, 3))).astype(np.float32)
+    across = math.ceil(count**0.5)
+    cell = np.stack((np.arange(count) % across, np.arange(count) // across), 1)[:, None]
+    uv = ((cell + np.array([[0.2, 0.2], [0.8, 0.2], [0.2, 0.8]])) / across).astype(np.float32)
+    corners = torch.arange(3 * count).view(-1, 3)
+    mesh = Mesh(torch.from_numpy(points.reshape(-1, 3)), corners, torch.from_numpy(uv.reshape(-1, 2)), corners)
+    return TexturedModel(Atlas(mesh, side, side, "scan", count), torch.full((side, side, 3), 99, dtype=torch.uint8))
+
+
+def test_a_model_for_phones_that_misses_its_limits_is_made_and_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full, told = loose_pieces(800, 256), Told()
+    monkeypatch.setattr(levels, "MOBILE_FACES", 400)
+    monkeypatch.setattr(levels, "MOBILE_BYTES", 10_000)
+    write_smaller(tmp_path, full.atlas, full.texture, {"mobile"}, up_axis="+z", monitor=told)
+    size = (tmp_path / "model_mobile.glb").stat().st_size
+    (problem,) = told.problems
+    assert (problem.code, problem.where) == ("mobile_limits_missed", "model_mobile.glb")
+    assert f"it has {size / 1e6:.1f} MB, more than 0, with its image as a JPEG of quality 50" in problem.message
+    assert re.search(r"it lacks [2-4]\d% of the surface", problem.message), "half of the pieces are left out"
+    assert "loose pieces" in problem.remedy
+
+
+def test_pieces_whose_charts_fit_in_no_image_for_phones_leave_the_model_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full, told = loose_pieces(300, 512), Told()
+    for name, value in {"MOBILE_FACES": 290, "SMALL_SIDE": 128, "MOBILE_SIDE": 128}.items():
+        monkeypatch.setattr(levels, name, value)
+    (path,) = write_smaller(tmp_path, full.atlas, full.texture, {"mobile"}, up_axis="+z", monitor=told)
+    assert len(load_model(path)[0].mesh.t_pos_idx) == 300
+    (problem,) = told.problems
+    assert "it has 300 faces, more than 290" in problem.message
+    assert "512 texels a side, more than 128" in problem.message
+
+
+def test_a_level_whose_charts_do_not_fit_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    full, told = many_charts(8, 64), Told()
+    monkeypatch.setattr(levels, "MOBILE_SIDE", 128)
+    assert write_smaller(tmp_path, full.atlas, full.texture, {"lod"}, up_axis="+z", monitor=told) == ()
+    assert [(problem.code, problem.where) for problem in told.problems] == [("level_left_out", "model_lod1.glb")]

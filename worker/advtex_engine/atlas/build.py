@@ -119,11 +119,11 @@ def _keep_uv(mesh: Mesh, wanted: Floats, config: TextureConfig) -> Atlas:
     side = math.sqrt(wanted.sum() / _uv_areas(_uv_corners(mesh)).sum())
     size = min(_round_up(side), _cap(config))
     assert mesh.t_uv_idx is not None
-    return Atlas(mesh, size, size, "scan", _count_islands(mesh.t_uv_idx.numpy()))
+    return Atlas(mesh, size, size, "scan", int(uv_islands(mesh.t_uv_idx.numpy()).max()) + 1)
 
 
-def _count_islands(t_uv_idx: Integers) -> int:
-    """Connected pieces in uv: faces that share a uv index."""
+def uv_islands(t_uv_idx: Integers) -> Integers:
+    """[T] numbers from 0 on of the connected pieces in uv that faces belong to: they share a uv index."""
     label = np.arange(int(t_uv_idx.max()) + 1)
     while True:
         least = label[t_uv_idx].min(axis=1)
@@ -131,7 +131,7 @@ def _count_islands(t_uv_idx: Integers) -> int:
         np.minimum.at(new, t_uv_idx.reshape(-1), np.repeat(least, 3))
         new = new[new]
         if np.array_equal(new, label):
-            return len(np.unique(label[t_uv_idx]))
+            return np.unique(label[t_uv_idx[:, 0]], return_inverse=True)[1].reshape(-1)
         label = new
 
 

@@ -67,7 +67,12 @@ def export_model(
 
 def write_glb(path: Path, atlas: Atlas, texture: Tensor, *, up_axis: str, quality: int = JPEG_QUALITY) -> None:
     """The GLB alone, its images JPEGs; `export_model` describes the rest."""
-    _write_glb(path, split_pages(atlas, texture), vertex_normals(on_cpu(atlas.mesh)), up_axis, False, quality)
+    write_pages(path, split_pages(atlas, texture), vertex_normals(on_cpu(atlas.mesh)), up_axis, quality)
+
+
+def write_pages(path: Path, pages: Sequence[Page], normals: Tensor, up_axis: str, quality: int = JPEG_QUALITY) -> None:
+    """The GLB of these pages. normals: [V,3] of their vertices."""
+    _write_glb(path, pages, normals, up_axis, False, quality)
 
 
 # OBJ

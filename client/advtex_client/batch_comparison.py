@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from advtex_client._display import drawn_table, duration
+from advtex_contract.jobs import JobState
 
 LESS_IS_BETTER = ("lpips", "lpips_full", "band_error", "sliced_wasserstein")
 MORE_IS_BETTER = ("psnr", "ssim")
+ALONE, WHICH = ([JobState.succeeded, None], [None, JobState.succeeded]), ("first", "second")
+NAMED = 3
 
 Row = Mapping[str, Any]
 
@@ -31,10 +34,14 @@ def compared(first: Iterable[Row], second: Iterable[Row]) -> dict[str, Any]:
 
 
 def comparison_text(found: Mapping[str, Any]) -> str:
-    """Describe what `compared` returns, for people: a table, then a line per score."""
+    """Describe what `compared` returns, for people: a table, then a line per score. Scans that only one batch has are
+    counted, unless they have not succeeded."""
     names = list(found["scores"])
     lines = []
+    alone = [[scan["label"] for scan in found["scans"] if scan["states"] == pair] for pair in ALONE]
     for scan in found["scans"]:
+        if scan["states"] in ALONE:
+            continue
         states = scan["states"]
         state = states[0] if states[0] == states[1] else f"{states[0] or 'none'} -> {states[1] or 'none'}"
         spent = " -> ".join("" if seconds is None else duration(seconds) for seconds in scan["gpu_seconds"])
@@ -47,7 +54,14 @@ def comparison_text(found: Mapping[str, Any]) -> str:
         for name, about in told.items()
         if about is not None
     ]
-    return "\n".join([table, *means])
+    return "\n".join(
+        [table, *(_counted(labels, which) for labels, which in zip(alone, WHICH, strict=True) if labels), *means]
+    )
+
+
+def _counted(labels: Sequence[str], which: str) -> str:
+    few = ", ".join(labels[:NAMED]) + (" ..." if len(labels) > NAMED else "")
+    return f"only in the {which}, and succeeded: {len(labels)} ({few})"
 
 
 def _by_label(rows: Iterable[Row]) -> dict[tuple[str, int], Row]:

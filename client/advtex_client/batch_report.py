@@ -18,6 +18,8 @@ from advtex_client.errors import ClientError
 from advtex_contract.jobs import BatchView
 
 COLUMNS = ("label", "job", "state", "attempt", "steps", "gpu_seconds", "elapsed_seconds", "late", "reason")
+SHOWN = ("label", "state", "attempt", "steps", "gpu_seconds", "elapsed_seconds", "late")
+ALWAYS_SHOWN = ("label", "state", "gpu_seconds")
 FORMULA = ("=", "+", "-", "@", "\t", "\r")  # how cells begin that spreadsheets would compute
 NOTE = (
     "GPU seconds are what the stages of all attempts took on their workers; work that was lost with a worker is not in "
@@ -54,7 +56,7 @@ def write_report(path: Path, batch: BatchView, rows: Sequence[Row], thumbnails: 
 
 
 def _cells(row: Row, scores: Sequence[str]) -> list[Any]:
-    """Return the row as CSV and page show it, None for what it does not have."""
+    """Return the row as the CSV shows it, None for what it does not have."""
     return [*(row.get(name) for name in COLUMNS), *(row.get("scores", {}).get(name) for name in scores)]
 
 
@@ -74,17 +76,34 @@ def _harmless(cell: Any) -> Any:
 
 def _page(batch: BatchView, rows: Sequence[Row], thumbnails: Mapping[str, bytes]) -> str:
     scores = score_names(rows)
-    heads = [f'<th scope="col"><button>{escape(name.replace("_", " "))}</button></th>' for name in (*COLUMNS, *scores)]
-    spent = duration(sum(row["gpu_seconds"] for row in rows))
-    means = [f"mean {name} {mean:.4g}" for name, mean in score_means(rows).items()]
+    names = [name for name in SHOWN if name in ALWAYS_SHOWN or any(row.get(name) for row in rows)] + scores
+    heads = [f'<th scope="col"><button>{escape(name.replace("_", " "))}</button></th>' for name in names]
+    means = score_means(rows)
+    mean = "".join(f'<td class="number">{means[name]:.4g}</td>' if name in means else "<td></td>" for name in names[1:])
     template = Template(files("advtex_client").joinpath("batch_report.html").read_text(encoding="utf-8"))
     return template.substitute(
         title=escape(f"Batch {batch.id}"),
-        summary=escape("; ".join([batch_line(batch), f"{spent} of GPU time", *means])),
+        summary=escape(f"{batch_line(batch)}; {duration(sum(row['gpu_seconds'] for row in rows))} of GPU time"),
+        reasons=_reasons(rows),
         head='<th scope="col">picture</th>' + "".join(heads),
-        rows="\n".join(_line(row, scores, thumbnails.get(row["job"])) for row in rows),
+        mean=f'<tr><td></td><th scope="row">mean</th>{mean}</tr>' if means else "",
+        rows="\n".join(_line(row, names, thumbnails.get(row["job"])) for row in rows),
         note=escape(NOTE),
     )
+
+
+def _reasons(rows: Sequence[Row]) -> str:
+    """Show why jobs failed or wait, each reason once with all that have it."""
+    found: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        if row.get("reason"):
+            found.setdefault((row["state"], row["reason"]), []).append(row)
+    items = []
+    for (state, reason), having in found.items():
+        links = ", ".join(f'<a href="#{escape(row["job"])}">{escape(row["label"] or row["job"])}</a>' for row in having)
+        told = f'<span class="state {escape(state)}">{escape(state)}</span>: {links}'
+        items.append(f'<li>{told}<p class="reason">{escape(reason)}</p></li>')
+    return f"<h2>Failed, or waiting</h2>\n<ul>{''.join(items)}</ul>" if items else ""
 
 
 def score_means(rows: Sequence[Row]) -> dict[str, float]:
@@ -93,14 +112,16 @@ def score_means(rows: Sequence[Row]) -> dict[str, float]:
     return {name: sum(values) / len(values) for name, values in found.items()}
 
 
-def _line(row: Row, scores: Sequence[str], thumbnail: bytes | None) -> str:
+def _line(row: Row, names: Sequence[str], thumbnail: bytes | None) -> str:
+    label, job = escape(row["label"] or row["job"]), escape(row["job"])
     picture = ""
     if thumbnail is not None:
         data = base64.b64encode(thumbnail).decode()
-        picture = f'<img alt="{escape(row["label"] or row["job"])}" src="data:image/jpeg;base64,{data}">'
-    names = (*COLUMNS, *scores)
-    cells = "".join(_cell(name, value) for name, value in zip(names, _cells(row, scores), strict=True))
-    return f'<tr class="{escape(row["state"])}"><td>{picture}</td>{cells}</tr>'
+        picture = f'<img alt="{label}" decoding="async" src="data:image/jpeg;base64,{data}">'
+    name = f'<th scope="row" data-value="{label}">{label}<br><code>{job}</code></th>'
+    values = {**row, **row.get("scores", {})}
+    cells = "".join(_cell(name, values.get(name)) for name in names[1:])
+    return f'<tr id="{job}"><td>{picture}</td>{name}{cells}</tr>'
 
 
 def _cell(name: str, value: Any) -> str:
@@ -110,4 +131,4 @@ def _cell(name: str, value: Any) -> str:
         shown = duration(value) if name.endswith("_seconds") else f"{value:.4g}" if isinstance(value, float) else value
         return f'<td class="number" data-value="{value}">{shown}</td>'
     text = escape(value or "")
-    return f'<td class="{name}" data-value="{text}">{text}</td>'
+    return f'<td class="{name} {text}" data-value="{text}">{text}</td>'

@@ -135,7 +135,8 @@ def _report_row(client: Client, job: JobView) -> dict[str, Any]:
     if job.finished_at is not None:
         row["elapsed_seconds"] = round((job.finished_at - job.created_at).total_seconds(), 1)
     if job.error is not None:
-        row["reason"] = "\n".join([job.error.message, *finding_lines(job.error.details)])
+        told = job.error.message
+        row["reason"] = "\n".join([told, *finding_lines(d for d in job.error.details if d.message not in told)])
     elif job.waiting_reason:
         row["reason"] = job.waiting_reason
     return row | {"scores": _scores(client, job)}

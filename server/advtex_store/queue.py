@@ -21,6 +21,7 @@ from redis.backoff import NoBackoff
 from redis.retry import Retry
 from rq import Queue
 from rq.exceptions import DuplicateJobError, NoSuchJobError
+from rq.intermediate_queue import IntermediateQueue
 from rq.job import Job
 from rq.serializers import JSONSerializer
 
@@ -163,7 +164,12 @@ class JobQueue:
         if self.holds(job_id, attempt):
             return False
         with suppress(NoSuchJobError):
-            self._fetch(rq_id(job_id, attempt)).delete()
+            name = rq_id(job_id, attempt)
+            job = self._fetch(name)
+            taken = IntermediateQueue(_key(job.origin), self.redis)
+            taken.remove(name)
+            self.redis.delete(taken.get_first_seen_key(name))
+            job.delete()
         return self._enqueue(job_id, attempt, gib, front)
 
     def holds(self, job_id: str, attempt: int) -> bool:
@@ -177,7 +183,12 @@ class JobQueue:
             return True
         if job.is_finished or job.is_failed or job.is_canceled or job.is_stopped:
             return False
-        since = job.started_at or job.enqueued_at
+        taken = IntermediateQueue(_key(job.origin), self.redis)
+        if self.redis.lpos(taken.key, name) is not None:  # a worker has it, and is about to begin with it
+            taken.set_first_seen(name)
+            since = taken.get_first_seen(name)
+        else:
+            since = job.started_at or job.enqueued_at
         if since is None:
             return False
         age = (datetime.now(UTC) - (since if since.tzinfo else since.replace(tzinfo=UTC))).total_seconds()

@@ -114,7 +114,9 @@ def test_the_report_is_one_page_with_csv_and_json_beside_it(connect: Connect, tm
     files = [tmp_path / "out" / f"report.{kind}" for kind in ("html", "csv", "json")]
     assert json.loads(ran.stdout) == {"files": [str(file) for file in files]}
     page, table, data = (file.read_text() for file in files)
-    assert "3 jobs, 1 rejected, 2 succeeded; 2 min 0 s of GPU time; mean lpips 0.375" in page
+    assert "3 jobs, 1 rejected, 2 succeeded; 2 min 0 s of GPU time<" in page
+    assert '<th scope="row">mean</th>' in page
+    assert '<td class="number">0.375</td>' in page
     assert page.count('src="data:image/jpeg;base64,/9j/IHBpY3R1cmU="') == 2
     assert "the scan cannot be &lt;b&gt;textured&lt;/b&gt;\nerror: color/&lt;1&gt;.png: is no image" in page
     rows = {row["job"]: row for row in csv.DictReader(table.splitlines(keepends=True))}
@@ -126,13 +128,39 @@ def test_the_report_is_one_page_with_csv_and_json_beside_it(connect: Connect, tm
     assert next(job for job in told["jobs"] if job["job"] == "j0")["stage_seconds"]["optimization"] == 58.04
 
 
+def test_reasons_are_told_once_with_all_that_have_them(connect: Connect, tmp_path: Path) -> None:
+    """The message of a scan that a worker could not read tells of all problems, of which there are details too."""
+    places = [ErrorDetail(where=f"color/{n}.png", message="cannot be decoded", remedy="leave it out") for n in range(9)]
+    why = JobError(code="x", message="color/0.png and 8 more: cannot be decoded (leave it out)", details=places)
+    lost = [view(f"j{n}", JobState.failed, label=f"hall{n}", error=why) for n in range(2)]
+    connect({"night": [*lost, view("j2", label="attic", waiting_reason="no worker is running")]})
+    assert run("report", "night", "-o", tmp_path / "r.html").exit_code == 0
+    page = (tmp_path / "r.html").read_text()
+    (reasons,) = re.findall(r"<ul>.*</ul>", page, re.DOTALL)
+    assert page.count("cannot be decoded") == reasons.count("cannot be decoded") == 1
+    links = re.findall(r'<a href="#(\w+)">(\w+)</a>', reasons)
+    assert links == [("j2", "attic"), ("j0", "hall0"), ("j1", "hall1")]
+    assert all(f'<tr id="{job}">' in page for job, _ in links)
+
+
+def test_columns_that_say_nothing_are_not_shown(connect: Connect, tmp_path: Path) -> None:
+    connect({"night": night()})
+    assert run("report", "night", "-o", tmp_path / "r.html").exit_code == 0
+    heads = re.findall(r"<button>(.*?)</button>", (tmp_path / "r.html").read_text())
+    assert heads == ["label", "state", "attempt", "steps", "gpu seconds", "elapsed seconds", "lpips"]
+    connect({"night": [view("j0", JobState.failed, label="hall")]})
+    assert run("report", "night", "-o", tmp_path / "r.html").exit_code == 0
+    heads = re.findall(r"<button>(.*?)</button>", (tmp_path / "r.html").read_text())
+    assert heads == ["label", "state", "gpu seconds"]
+
+
 def test_what_users_write_stays_text(connect: Connect, tmp_path: Path) -> None:
     connect({"night": night()})
     assert run("report", "night", "-o", tmp_path / "r.html").exit_code == 0
     read = Elements((tmp_path / "r.html").read_text())
     assert [tag for tag, _ in read.found].count("script") == 1
     images = [attributes for tag, attributes in read.found if tag == "img"]
-    assert [set(image) for image in images] == [{"alt", "src"}] * 2
+    assert [set(image) for image in images] == [{"alt", "decoding", "src"}] * 2
     assert HOSTILE in {image["alt"] for image in images}
     assert HOSTILE in read.texts
     assert not any(name.startswith("on") for _, attributes in read.found for name in attributes)
@@ -192,6 +220,15 @@ def test_two_batches_are_compared_by_label(connect: Connect) -> None:
     connect({"night1": first[:2], "night2": second})
     assert run("compare", "night1", "night2").exit_code == 0
     assert run("compare", "night1", "none").exit_code == 2
+
+
+def test_scans_of_one_batch_alone_are_counted(connect: Connect) -> None:
+    night = [view(f"a{n}", JobState.succeeded, label=f"hall{n}") for n in range(9)]
+    connect({"night1": night, "night2": [view("b0", JobState.succeeded, label="hall8")]})
+    lines = run("compare", "night1", "night2").stdout.splitlines()
+    assert [line.split()[0] for line in lines[:2]] == ["label", "hall8"]
+    assert "only in the first, and succeeded: 8 (hall0, hall1, hall2 ...)" in lines
+    assert not any(line.startswith("hall0") for line in lines)
 
 
 def test_the_worst_of_a_score_is_where_it_became_worse() -> None:

@@ -25,7 +25,7 @@ PAGES = sorted(
     [
         *ROOT.glob("*.md"),
         *(ROOT / ".github").rglob("*.md"),
-        *(path for room in ROOMS for path in (ROOT / room).glob("*.md")),
+        *(path for room in (*ROOMS, "docker") for path in (ROOT / room).glob("*.md")),
     ]
 )
 WORDS = [page for page in PAGES if page.name != "CHANGELOG.md"]  # which speaks of what was, too

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 import zlib
 from datetime import UTC, datetime, timedelta
 from typing import Any
@@ -78,6 +79,22 @@ def test_an_attempt_whose_worker_died_before_claiming_comes_back(queue: JobQueue
     assert not queue.holds("job", 1)
     assert queue.offer("job", 1, 8)
     assert queue.waiting_ids(8) == ["job-1"]
+
+
+def test_an_attempt_that_has_waited_for_long_and_was_just_taken_is_held(queue: JobQueue) -> None:
+    """The taker has as long for its claim as one of a job that had not waited; then it is held for dead."""
+    for _ in range(2):
+        queue.offer("job", 1, 8)
+        job = Job.fetch("job-1", connection=queue.redis, serializer=JSONSerializer)
+        job.enqueued_at = datetime.now(UTC) - timedelta(seconds=10 * STARTED_GRACE_SECONDS)
+        job.save()
+        taken = Queue(queue_name(8), connection=queue.redis).intermediate_queue
+        assert queue.redis.lmove("rq:queue:advtex-8", taken.key) == b"job-1"
+        assert not queue.offer("job", 1, 8)
+        queue.redis.set(taken.get_first_seen_key("job-1"), time.time() - STARTED_GRACE_SECONDS - 1)
+        assert queue.offer("job", 1, 8)
+        assert queue.waiting_ids(8) == ["job-1"]
+        assert taken.get_job_ids() == []
 
 
 def test_an_attempt_that_broke_in_the_worker_comes_back(queue: JobQueue) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +24,8 @@ from advtex_server.embedded import free_port, redis_binary
 from advtex_store.database import upgrade_database
 from advtex_store.settings import StoreSettings
 from advtex_store.store import Store, open_store
+
+REAL_WORKER = ["-m", "advtex_worker.main"]
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ class Fleet:
         self.workers: list[subprocess.Popen[bytes]] = []
         self._workers = workers
         self._dispatch = dispatch
-        self._dispatchers: list[subprocess.Popen[bytes]] = []
+        self.dispatchers: list[subprocess.Popen[bytes]] = []
         for name, value in (place.s3 or {}).items():
             os.environ[name] = value  # for the store of the test's own process; `fleet` puts them back
         self.settings = StoreSettings(
@@ -105,14 +107,16 @@ class Fleet:
         command += ["--port", str(self.ports[number])]
         if not self._dispatch:
             command.append("--no-dispatch")
-        return self._start(command, self._server_variables(f"server-{number}"), release)
+        return self._start(command, self.server_variables(f"server-{number}"), release)
 
     def start_dispatcher(self) -> subprocess.Popen[bytes]:
         command = [PRESENT.python, "-m", "advtex_server.main", "dispatch"]
-        self._dispatchers.append(self._start(command, self._server_variables("dispatcher")))
-        return self._dispatchers[-1]
+        self.dispatchers.append(self._start(command, self.server_variables("dispatcher")))
+        return self.dispatchers[-1]
 
-    def start_worker(self, number: int, release: Release = PRESENT) -> subprocess.Popen[bytes]:
+    def start_worker(
+        self, number: int, release: Release = PRESENT, arguments: Sequence[str] = ()
+    ) -> subprocess.Popen[bytes]:
         """Its lines to Redis, database and object storage go through `lines`."""
 
         def through(name: str, url: str) -> str:
@@ -122,15 +126,16 @@ class Fleet:
             return urlunsplit(parts._replace(netloc=f"{parts.netloc.rpartition(':')[0]}:{self.lines[name].port}"))
 
         variables = self._variables(through) | {"ADVTEX_WORK_DIR": str(self.place.data / f"work-{number}")}
-        return self._start([release.python, str(release.support / "run_worker.py"), self._engine], variables, release)
+        program = [str(release.support / "run_worker.py"), self._engine] if self._engine else REAL_WORKER
+        return self._start([release.python, *program, *arguments], variables, release)
 
     def stop(self) -> None:
         self.store.close()
-        for process in (*self.workers, *self.servers, *self._dispatchers, self.redis):
+        for process in (*self.workers, *self.servers, *self.dispatchers, self.redis):
             kill_tree(process.pid)
             process.wait()
 
-    def _server_variables(self, name: str) -> dict[str, str]:
+    def server_variables(self, name: str) -> dict[str, str]:
         """Where rows and blobs are elsewhere, it shares no folder with any other."""
         variables = self._variables(lambda _name, url: url)
         if self.place.database_url and self.place.blob_url:
@@ -173,7 +178,8 @@ def fleet(
     variables: Mapping[str, str] = MappingProxyType({}),
     dispatch: bool = True,
 ) -> Iterator[Fleet]:
-    """Started, and stopped at the end with everything it has started. `variables`: settings of all its processes.
+    """Started, and stopped at the end with everything it has started. `engine`: of `fake_engines`; empty for
+    advtex-worker itself, with the real one. `variables`: settings of all its processes.
     `dispatch`: whether the servers do; else `start_dispatcher` starts one that does nothing else."""
     with ExitStack() as stack:
         before = dict(os.environ)

@@ -14,6 +14,7 @@ import pytest
 from attempts import in_background, result, step_of
 from live_service import wait_until
 from redis import Redis
+from structlog.testing import capture_logs
 
 from advtex_contract.jobs import JobState
 from advtex_store import keys
@@ -44,6 +45,23 @@ def test_a_job_succeeds_with_results_warnings_and_progress(
     assert row.progress["losses"] == {"l1": pytest.approx(1 / 3)}
     assert row.progress["stage_seconds"] == {"ingest": 0.01, "optimization": 0.02}
     assert list(settings.workspaces.iterdir()) == []
+
+
+def test_a_job_that_is_done_loses_no_lease_while_its_checkpoints_are_removed(
+    store: Store, host: Hosts, new_job: NewJob, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    delete = type(store.blobs).delete_prefix
+
+    def slowly(*arguments: Any) -> Any:
+        time.sleep(0.2)  # some heartbeats
+        return delete(*arguments)
+
+    monkeypatch.setattr(type(store.blobs), "delete_prefix", slowly)
+    job_id = new_job(steps=3)
+    with capture_logs() as lines:
+        run_attempt(host("stepping"), job_id, 1)
+    assert store.records.job(job_id).state == JobState.succeeded
+    assert [line for line in lines if line["log_level"] != "info"] == []
 
 
 def test_an_attempt_that_is_not_waited_for_does_nothing(store: Store, host: Hosts, new_job: NewJob) -> None:

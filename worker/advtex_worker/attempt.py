@@ -243,6 +243,7 @@ class Attempt:
             self._patience.transfer(
                 lambda: self._store.results.commit(job_id, number, self._space.results(), self._warnings)
             )
+            self._keeper.stop()  # of a job that has ended there is no lease to be lost
             with suppress(Exception):  # they are only worth their space now; deleting the job removes them too
                 self._store.blobs.delete_prefix(keys.checkpoints_prefix(job_id))
                 self._store.blobs.delete_prefix(keys.live_prefix(job_id))

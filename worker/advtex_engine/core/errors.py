@@ -34,10 +34,13 @@ def few_of(names: Sequence[str]) -> str:
 
 
 class ScanError(EngineError):
-    """The scan cannot be textured."""
+    """The scan cannot be textured. The message tells of problems that differ in their places alone once."""
 
     def __init__(self, *problems: Problem) -> None:
-        super().__init__("; ".join(f"{p.where}: {p.message} ({p.remedy})" for p in problems))
+        places = dict[tuple[str, str], list[str]]()
+        for problem in problems:
+            places.setdefault((problem.message, problem.remedy), []).append(problem.where)
+        super().__init__("; ".join(f"{few_of(names)}: {what} ({remedy})" for (what, remedy), names in places.items()))
         self.problems = problems
 
 

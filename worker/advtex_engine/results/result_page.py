@@ -14,7 +14,7 @@ from typing import Any
 from advtex_engine.runtime.files import json_text, write_atomically
 
 TEMPLATE = Path(__file__).with_name("result_page.html")
-LEFT_OUT = ("losses",)  # of the report: the curves have them
+LEFT_OUT = ("losses", "game")  # of the report: the curves have them
 
 
 def write_page(out: Path, report: Mapping[str, Any], files: Sequence[Path]) -> Path:
@@ -27,6 +27,7 @@ def write_page(out: Path, report: Mapping[str, Any], files: Sequence[Path]) -> P
         "manifest": json.loads((previews / "manifest.json").read_bytes()),
         "curves": json.loads((previews / "curves.json").read_bytes()),
         "report": {name: part for name, part in report.items() if name not in LEFT_OUT},
+        "game": (report.get("game") or {}).get("points", []),
         "files": [file.name for file in files if file.parent == out],
     }
     page = Template(TEMPLATE.read_text(encoding="utf-8")).substitute(data=embedded(data))

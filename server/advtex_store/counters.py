@@ -21,8 +21,11 @@ FAILURES = "failures"  # jobs that failed or were rejected, by the error's code
 JOBS = "jobs"  # ended, by state
 STAGE_BUCKETS = "stage_buckets"  # the same times, counted by stage and the bound that they stay below: `atlas 30`
 STAGES = "stages"  # seconds, of jobs that ended
+ACCURACY_BUCKETS = "accuracy_buckets"  # the same shares as below, by preset and bound: `standard 0.55`
+ACCURACY = "accuracy"  # of patches that a discriminator told apart at the end of a job that succeeded, by preset
 
 STAGE_BOUNDS = (1, 3, 10, 30, 60, 180, 600, 1800, 3600, 10_800, 36_000)  # seconds
+ACCURACY_BOUNDS = (0.45, 0.55, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)  # it guesses up to .55, and is certain above .95
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,9 +77,10 @@ def count_one(session: Session, name: str, label: str, total: float = 0.0) -> No
 
 
 def count_end(
-    session: Session, state: str, error: Mapping[str, Any] | None, stage_seconds: Mapping[str, float]
+    session: Session, state: str, error: Mapping[str, Any] | None, progress: Mapping[str, Any], preset: str
 ) -> None:
-    """Count a job that has ended."""
+    """Count a job that has ended. preset: as it was asked for."""
+    stage_seconds: Mapping[str, float] = progress.get("stage_seconds", {})
     if error is not None:
         count_one(session, FAILURES, str(error["code"]))
     count_one(session, JOBS, state)
@@ -85,6 +89,11 @@ def count_end(
             count_one(session, STAGE_BUCKETS, f"{stage} {bound}")
     for stage, seconds in sorted(stage_seconds.items()):
         count_one(session, STAGES, stage, seconds)
+    accuracy = progress.get("losses", {}).get("accuracy")
+    if state == JobState.succeeded and accuracy is not None:
+        if bound := next((bound for bound in ACCURACY_BOUNDS if accuracy <= bound), None):
+            count_one(session, ACCURACY_BUCKETS, f"{preset} {bound}")
+        count_one(session, ACCURACY, preset, accuracy)
 
 
 class Counters:

@@ -59,7 +59,7 @@ class Transitions:
         row.cancel_requested = False
         for name, value in values.items():
             setattr(row, name, value)
-        count_end(session, row.state, row.error, row.progress.get("stage_seconds", {}))
+        count_end(session, row.state, row.error, row.progress, row.options.get("preset", "auto"))
         return row
 
     def _get(self, session: Session, job_id: str, owner: str | None, *, lock: bool = False) -> JobRow:

@@ -19,9 +19,9 @@ class CurveSet(BaseModel):
 class Curves(CurveSet):
     """Losses, what the discriminator knows, and quality as measured now and then on a few fixed views.
 
-    `accuracy_real`, `accuracy_fake`: shares of the real and of the fake patches that the discriminator tells for what
-    they are. `margin`, `spread`: of its logits. `gradient_…`: norms, now and then, of what each term adds to the
-    texture's gradient. Quality: `psnr` in dB, `gradient_ratio` of the photographs' gradients.
+    `accuracy`: share of patches that the discriminator tells apart; `accuracy_real`, `accuracy_fake`: of the real and
+    of the fake ones. `margin`, `spread`: of its logits. `gradient_…`: norms, now and then, of what each term adds to
+    the texture's gradient. Quality: `psnr` in dB, `gradient_ratio` of the photographs' gradients.
     """
 
     quality: CurveSet = CurveSet()

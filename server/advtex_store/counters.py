@@ -77,10 +77,9 @@ def count_one(session: Session, name: str, label: str, total: float = 0.0) -> No
 
 
 def count_end(
-    session: Session, state: str, error: Mapping[str, Any] | None, progress: Mapping[str, Any], preset: str
+    session: Session, state: str, error: Mapping[str, Any] | None, stage_seconds: Mapping[str, float]
 ) -> None:
-    """Count a job that has ended. preset: as it was asked for."""
-    stage_seconds: Mapping[str, float] = progress.get("stage_seconds", {})
+    """Count a job that has ended."""
     if error is not None:
         count_one(session, FAILURES, str(error["code"]))
     count_one(session, JOBS, state)
@@ -89,11 +88,14 @@ def count_end(
             count_one(session, STAGE_BUCKETS, f"{stage} {bound}")
     for stage, seconds in sorted(stage_seconds.items()):
         count_one(session, STAGES, stage, seconds)
-    accuracy = progress.get("losses", {}).get("accuracy")
-    if state == JobState.succeeded and accuracy is not None:
-        if bound := next((bound for bound in ACCURACY_BOUNDS if accuracy <= bound), None):
-            count_one(session, ACCURACY_BUCKETS, f"{preset} {bound}")
-        count_one(session, ACCURACY, preset, accuracy)
+
+
+def count_accuracy(session: Session, preset: str, accuracy: float) -> None:
+    """Count what share of patches a discriminator told apart at the end of a job; preset: as it was asked for."""
+    within = next((bound for bound in ACCURACY_BOUNDS if accuracy <= bound), None)
+    if within is not None:
+        count_one(session, ACCURACY_BUCKETS, f"{preset} {within}")
+    count_one(session, ACCURACY, preset, accuracy)
 
 
 class Counters:

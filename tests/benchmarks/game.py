@@ -60,6 +60,7 @@ from advtex_engine.runtime.devices import choose_device
 
 READINGS = 5
 TABLE = {
+    "accuracy": "told apart",
     "accuracy_real": "real told",
     "accuracy_fake": "fake told",
     "margin": "margin",
@@ -80,7 +81,7 @@ TABLE = {
     "ms": "ms per step",
 }
 PANELS = {
-    "share told apart": ("accuracy_real", "accuracy_fake"),
+    "share told apart": ("accuracy", "accuracy_real", "accuracy_fake"),
     "logits": ("margin", "spread"),
     "norm of the texture's gradient": ("gradient_adversarial", "gradient_l1", "gradient_features"),
     "LPIPS of held-out views": ("lpips", "lpips_corrected"),

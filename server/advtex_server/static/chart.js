@@ -4,11 +4,13 @@ import { count, el } from "./base.js";
 
 const TITLES = {
   l1: "L1 loss", adversarial: "Adversarial loss", discriminator: "Discriminator loss", psnr: "PSNR (dB)",
-  gradient_ratio: "Gradient ratio", accuracy_real: "Real patches told (share)", accuracy_fake: "Fake patches told (share)",
+  gradient_ratio: "Gradient ratio", accuracy: "Patches told apart (share)", accuracy_real: "Real patches told (share)",
+  accuracy_fake: "Fake patches told (share)",
   margin: "Margin (real − fake logits)", spread: "Spread of the logits", gradient_adversarial: "Gradient, adversarial",
   gradient_l1: "Gradient, L1", gradient_features: "Gradient, features",
 };
-const WHOLE = { accuracy_real: [0, 1], accuracy_fake: [0, 1] }; // noise about one half must not look like a curve
+// Drawn whole: noise about one half must not look like a curve.
+const WHOLE = { accuracy: [0, 1], accuracy_real: [0, 1], accuracy_fake: [0, 1] };
 const [WIDTH, HEIGHT, PAD] = [300, 110, 6];
 
 const short = (value) => (Math.abs(value) >= 100 ? value.toFixed(0) : Number(value.toPrecision(3)).toString());

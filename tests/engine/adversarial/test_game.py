@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from advtex_engine.adversarial.discriminator import PatchDiscriminator
-from advtex_engine.adversarial.game import accuracy, knowledge, problems, recent_accuracy, stretches, summary
+from advtex_engine.adversarial.game import knowledge, problems, recent_accuracy, stretches, summary
 from advtex_engine.adversarial.losses import told_apart
 from advtex_engine.adversarial.optimizer import AdversarialOptimizer
 from advtex_engine.core.config import PRESETS, PRINTED, Preset, PyramidLevel
@@ -74,12 +74,13 @@ def history(of: AdversarialOptimizer) -> list[dict[str, Any]]:
 
 def test_patches_are_counted_as_by_hand() -> None:
     real = [2.0, -1.0, 0.0, 3.0, 9.0]  # the last one does not count
-    fake = [-2.0, -4.0, 1.0, 0.0, -9.0]
+    fake = [-2.0, -4.0, -1.0, 1.0, -9.0]
     mask = torch.tensor([1.0, 1.0, 1.0, 1.0, 0.0]).view(1, 1, 1, 5)
     logits = [torch.tensor(values).view(1, 1, 1, 5) for values in (real, fake)]
     seen = knowledge((told_apart(*logits, mask) + told_apart(*logits, mask)).tolist())
+    assert seen["accuracy"] == 5.5 / 8
     assert seen["accuracy_real"] == 2.5 / 4, "a logit of 0 is a guess: half right"
-    assert seen["accuracy_fake"] == 2.5 / 4
+    assert seen["accuracy_fake"] == 3 / 4
     assert seen["margin"] == pytest.approx(statistics.mean(real[:4]) - statistics.mean(fake[:4]))
     within = (statistics.pvariance(real[:4]) + statistics.pvariance(fake[:4])) / 2
     assert seen["spread"] == pytest.approx(within**0.5)
@@ -136,13 +137,13 @@ def test_what_was_not_read_out_yet_is_saved() -> None:
 
 def test_a_dead_discriminator_is_told_and_that_nothing_was_done() -> None:
     points = history(optimizer(Dead()))
-    assert {accuracy(point) for point in points} == {0.5}
+    assert {point["accuracy"] for point in points} == {0.5}
     assert all(point["margin"] == point["spread"] == 0 for point in points)
     (problem,) = problems(points, PRESET)
     assert problem.code == "discriminator_at_chance"
     assert problem.where == "steps 4 to 60 of 60, at the end of its pretraining too"
     assert "told 50% of the patches apart, as guessing does (45% to 55%): it has learned nothing" in problem.message
-    assert "did nothing about it: the texture rests on L1 to its start and on matching what" in problem.message
+    assert "about it: there the texture rests on L1 to its start and on matching its features" in problem.message
     assert "view_selection" in problem.remedy
     told = summary(points, PRESET)
     assert [point["at"] for point in told["points"]] == ["end of pretraining", "middle", "end"]
@@ -167,7 +168,8 @@ def told(*shares: float) -> list[dict[str, Any]]:
     points = []
     for part, share in enumerate(shares):
         for fifth in range(5):
-            known = {"accuracy_real": share + 0.1, "accuracy_fake": share - 0.1, "margin": 1.0, "spread": 2.0}
+            known = {"accuracy": share, "accuracy_real": share + 0.1, "accuracy_fake": share - 0.1}
+            known |= {"margin": 1.0, "spread": 2.0}
             points.append({"step": 75 * part + 15 * (fifth + 1), "skipped": 0.25, **known})
     return points
 
@@ -192,13 +194,14 @@ def test_a_twentieth_of_the_run_is_enough_for_a_warning_that_says_where() -> Non
         "steps 76 to 150 of 1500, at the end of its pretraining too",
         "discriminator_at_chance",
     )
+    assert "it had not learned yet. The run did nothing about it: the texture was led by it as it was" in chance.message
     assert certain.where == "steps 151 to 1500 of 1500"
 
 
 def test_runs_of_a_few_steps_are_not_judged() -> None:
     few = dataclasses.replace(PRINTED, levels=(PyramidLevel(24),))
     points = [{"step": step, "accuracy_real": 0.5, "accuracy_fake": 0.5, "skipped": 0} for step in range(1, 25)]
-    points = [{**point, "margin": 0.0, "spread": 0.0} for point in points]
+    points = [{**point, "accuracy": 0.5, "margin": 0.0, "spread": 0.0} for point in points]
     assert problems(points, few) == []
     assert summary(points, few)["at_chance"] == 1.0
     assert summary([{"step": 24, "skipped": 1.0}], few)["points"] == [], "nothing was judged"

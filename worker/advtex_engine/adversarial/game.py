@@ -3,6 +3,7 @@
 A game is worth its steps while the discriminator tells some of the patches apart, and not all. At chance it has nothing
 to teach; where it is certain, no change that the texture can make fools it. A run reads out, beside its losses:
 
+accuracy                       share of the patches that it tells apart, half of which are real
 accuracy_real, accuracy_fake   shares of the real and of the fake patches that it tells for what they are
 margin, spread                 mean logit of the real patches less that of the fake; standard deviation about them
 gradient_adversarial, gradient_l1, gradient_features
@@ -19,7 +20,7 @@ from typing import Any
 from advtex_engine.core.config import Preset
 from advtex_engine.core.errors import Problem
 
-KNOWLEDGE_NAMES = ("accuracy_real", "accuracy_fake", "margin", "spread")
+KNOWLEDGE_NAMES = ("accuracy", "accuracy_real", "accuracy_fake", "margin", "spread")
 GAME_NAMES = (*KNOWLEDGE_NAMES, "gradient_adversarial", "gradient_l1", "gradient_features")
 CHANCE = (0.45, 0.55)  # of patches told apart: as many as by guessing
 CERTAIN = 0.95  # more than this
@@ -40,13 +41,13 @@ def knowledge(told: Sequence[float]) -> dict[str, float]:
         return {}
     real, fake = real_sum / patches, fake_sum / patches
     variance = (real_squares + fake_squares) / patches - real**2 - fake**2
-    spread = math.sqrt(max(variance, 0.0) / 2) if math.isfinite(variance) else math.nan
-    return dict(zip(KNOWLEDGE_NAMES, (real_right / patches, fake_right / patches, real - fake, spread), strict=True))
-
-
-def accuracy(point: Point) -> float:
-    """The share of all patches told apart: there are as many real ones as fake ones."""
-    return float(point["accuracy_real"] + point["accuracy_fake"]) / 2
+    return {
+        "accuracy": (real_right + fake_right) / (2 * patches),
+        "accuracy_real": real_right / patches,
+        "accuracy_fake": fake_right / patches,
+        "margin": real - fake,
+        "spread": math.sqrt(max(variance, 0.0) / 2) if math.isfinite(variance) else math.nan,
+    }
 
 
 @dataclass(frozen=True)
@@ -59,17 +60,15 @@ class Stretch:
 
     @property
     def at_chance(self) -> bool:
-        return CHANCE[0] <= accuracy(self.means) <= CHANCE[1]
+        return CHANCE[0] <= self.means["accuracy"] <= CHANCE[1]
 
     @property
     def certain(self) -> bool:
-        return accuracy(self.means) > CERTAIN
+        return self.means["accuracy"] > CERTAIN
 
     def described(self, place: str) -> dict[str, Any]:
         """For the report."""
-        return {"at": place, "step": self.last, "accuracy": accuracy(self.means)} | {
-            name: self.means[name] for name in KNOWLEDGE_NAMES
-        }
+        return {"at": place, "step": self.last} | {name: self.means[name] for name in KNOWLEDGE_NAMES}
 
 
 def stretches(points: Sequence[Point], pretraining: int, steps: int) -> list[Stretch]:
@@ -83,7 +82,7 @@ def stretches(points: Sequence[Point], pretraining: int, steps: int) -> list[Str
     before = 0
     for point in points:
         number = math.ceil((point["step"] - pretraining) / size)
-        if number >= 0 and "accuracy_real" in point:
+        if number >= 0 and "accuracy" in point:
             found.setdefault(number, []).append((before, point))
         before = point["step"]
     made = []
@@ -101,7 +100,7 @@ def stretches(points: Sequence[Point], pretraining: int, steps: int) -> list[Str
 def recent_accuracy(points: Sequence[Point], steps: int) -> float | None:
     """The share told apart over the last SHARE of the run's steps; None where nothing was judged in them."""
     since = points[-1]["step"] - SHARE * steps if points else 0
-    known = [accuracy(point) for point in points if point["step"] > since and "accuracy_real" in point]
+    known = [float(point["accuracy"]) for point in points if point["step"] > since and "accuracy" in point]
     return sum(known) / len(known) if known else None
 
 
@@ -134,21 +133,25 @@ def problems(points: Sequence[Point], preset: Preset) -> list[Problem]:
     chance, certain = ([part for part in parts if getattr(part, name)] for name in ("at_chance", "certain"))
     found = []
     if chance:
-        found.append(_chance(chance, len(chance) == len(parts), preset))
+        found.append(_chance(chance, len(parts), preset))
     if certain:
         found.append(_certain(certain, preset))
     return found
 
 
-def _chance(parts: Sequence[Stretch], always: bool, preset: Preset) -> Problem:
-    why = "it has learned nothing" if always else "it has not learned yet, or the texture fools it"
-    features = " and on matching what its layers respond" if preset.feature_weight else ""
+def _chance(parts: Sequence[Stretch], judged: int, preset: Preset) -> Problem:
+    features = " and on matching its features" if preset.feature_weight else ""
     target = {"start": "its start", "source": "the source view", "auxiliary": "the auxiliary view"}[preset.l1_target]
+    rests = f"there the texture rests on L1 to {target}{features}"
+    if parts[-1].last <= preset.pretraining:
+        why, rests = "it had not learned yet", "the texture was led by it as it was"
+    else:
+        why = "it has learned nothing" if len(parts) == judged else "it has not learned yet, or the texture fools it"
     return Problem(
         "discriminator_at_chance",
         _place(parts, preset),
         f"the discriminator told {_share(parts)} of the patches apart, as guessing does ({CHANCE[0]:.0%} to"
-        f" {CHANCE[1]:.0%}): {why}. The run did nothing about it: the texture rests on L1 to {target}{features} there",
+        f" {CHANCE[1]:.0%}): {why}. The run did nothing about it: {rests}",
         _remedy(preset),
     )
 
@@ -175,7 +178,7 @@ def _place(parts: Sequence[Stretch], preset: Preset) -> str:
 
 
 def _share(parts: Sequence[Stretch]) -> str:
-    return f"{sum(accuracy(part.means) * (part.last - part.first) for part in parts) / _steps(parts):.0%}"
+    return f"{sum(part.means['accuracy'] * (part.last - part.first) for part in parts) / _steps(parts):.0%}"
 
 
 def _steps(parts: Sequence[Stretch]) -> int:

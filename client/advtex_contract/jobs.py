@@ -151,10 +151,11 @@ class JobSpec(BaseModel):
 class Progress(BaseModel):
     """Where a running job stands.
 
-    losses: the newest values by name. stage_seconds: of all attempts. stage_peak_bytes, stage_device_peak_bytes: the
-    most memory that the engine's process, and its tensors on a GPU, took in a stage that has ended, in the last attempt
-    that ran it. steps_per_second: this attempt's rate in this stage. notes: what the engine has to say that is no
-    warning, in words.
+    losses: the newest values by name; `accuracy` is the share of patches that the discriminator told apart over the
+    last twentieth of the steps: one half is guessing. stage_seconds: of all attempts. stage_peak_bytes,
+    stage_device_peak_bytes: the most memory that the engine's process, and its tensors on a GPU, took in a stage that
+    has ended, in the last attempt that ran it. steps_per_second: this attempt's rate in this stage. notes: what the
+    engine has to say that is no warning, in words.
     """
 
     stage: str = ""

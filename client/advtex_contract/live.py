@@ -17,8 +17,12 @@ class CurveSet(BaseModel):
 
 
 class Curves(CurveSet):
-    """Losses, and quality as measured now and then on a few fixed views: `psnr` in dB, `gradient_ratio` of the
-    photographs' gradients."""
+    """Losses, what the discriminator knows, and quality as measured now and then on a few fixed views.
+
+    `accuracy`: share of patches that the discriminator tells apart; `accuracy_real`, `accuracy_fake`: of the real and
+    of the fake ones. `margin`, `spread`: of its logits. `gradient_…`: norms, now and then, of what each term adds to
+    the texture's gradient. Quality: `psnr` in dB, `gradient_ratio` of the photographs' gradients.
+    """
 
     quality: CurveSet = CurveSet()
 

@@ -18,7 +18,18 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from advtex_contract.jobs import STATES, WAITING, JobState
 from advtex_server.loops import Loop
-from advtex_store.counters import ATTEMPTS, FAILURES, JOBS, STAGE_BOUNDS, STAGE_BUCKETS, STAGES, Line
+from advtex_store.counters import (
+    ACCURACY,
+    ACCURACY_BOUNDS,
+    ACCURACY_BUCKETS,
+    ATTEMPTS,
+    FAILURES,
+    JOBS,
+    STAGE_BOUNDS,
+    STAGE_BUCKETS,
+    STAGES,
+    Line,
+)
 from advtex_store.fleet import LivingWorker
 from advtex_store.models import CounterRow
 from advtex_store.store import Store
@@ -221,29 +232,42 @@ def _so_far(counts: Iterable[CounterRow]) -> Iterable[Metric]:
         JOBS: CounterMetricFamily("advtex_jobs_ended", "Jobs that ended, by state", labels=["state"]),
     }
     found = {name: Tally(dict.fromkeys(labels, 0)) for name, labels in LABELS.items()}
-    within, spent = defaultdict[str, Tally[int]](Tally), list[CounterRow]()
+    counts = list(counts)
     for row in counts:
-        if row.name == STAGES:
-            spent.append(row)
-        elif row.name == STAGE_BUCKETS:
-            stage, _, bound = row.label.rpartition(" ")
-            within[stage][int(bound)] = row.count
-        elif row.name in families:
+        if row.name in families:
             found[row.name][row.label] = row.count
     for name, labels in found.items():
         for label, count in sorted(labels.items()):
             families[name].add_metric([label], count)
-    stages = HistogramMetricFamily("advtex_stage_seconds", "Time in stages, of jobs that ended", labels=["stage"])
-    for row in spent:
-        seen = within[row.label]
-        buckets = [
-            (f"{float(bound)}", float(sum(number for b, number in seen.items() if b <= bound)))
-            for bound in STAGE_BOUNDS
-        ]
-        # Releases that know no buckets count the rest.
-        stages.add_metric([row.label], [*buckets, ("+Inf", float(row.count))], row.total)
     yield from families.values()
-    yield stages
+    stages = HistogramMetricFamily("advtex_stage_seconds", "Time in stages, of jobs that ended", labels=["stage"])
+    yield _filled(stages, counts, STAGES, STAGE_BUCKETS, STAGE_BOUNDS)
+    accuracy = HistogramMetricFamily(
+        "advtex_discriminator_accuracy",
+        "Share of patches that the discriminator told apart at the end of jobs that succeeded",
+        labels=["preset"],
+    )
+    yield _filled(accuracy, counts, ACCURACY, ACCURACY_BUCKETS, ACCURACY_BOUNDS)
+
+
+def _filled(
+    family: HistogramMetricFamily, counts: Sequence[CounterRow], name: str, of_buckets: str, bounds: Sequence[float]
+) -> HistogramMetricFamily:
+    """The histogram of the rows that count values by label, and of those that count the ones within each bound."""
+    within = defaultdict[str, Tally[float]](Tally)
+    for row in counts:
+        if row.name == of_buckets:
+            label, _, bound = row.label.rpartition(" ")
+            within[label][float(bound)] = row.count
+    for row in counts:
+        if row.name == name:
+            seen = within[row.label]
+            buckets = [
+                (f"{float(bound)}", float(sum(number for b, number in seen.items() if b <= bound))) for bound in bounds
+            ]
+            # Releases that know no buckets count the rest.
+            family.add_metric([row.label], [*buckets, ("+Inf", float(row.count))], row.total)
+    return family
 
 
 class MetricsMiddleware:

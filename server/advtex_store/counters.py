@@ -21,8 +21,11 @@ FAILURES = "failures"  # jobs that failed or were rejected, by the error's code
 JOBS = "jobs"  # ended, by state
 STAGE_BUCKETS = "stage_buckets"  # the same times, counted by stage and the bound that they stay below: `atlas 30`
 STAGES = "stages"  # seconds, of jobs that ended
+ACCURACY_BUCKETS = "accuracy_buckets"  # the same shares as below, by preset and bound: `standard 0.55`
+ACCURACY = "accuracy"  # of patches that a discriminator told apart at the end of a job that succeeded, by preset
 
 STAGE_BOUNDS = (1, 3, 10, 30, 60, 180, 600, 1800, 3600, 10_800, 36_000)  # seconds
+ACCURACY_BOUNDS = (0.45, 0.55, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)  # it guesses up to .55, and is certain above .95
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +88,14 @@ def count_end(
             count_one(session, STAGE_BUCKETS, f"{stage} {bound}")
     for stage, seconds in sorted(stage_seconds.items()):
         count_one(session, STAGES, stage, seconds)
+
+
+def count_accuracy(session: Session, preset: str, accuracy: float) -> None:
+    """Count what share of patches a discriminator told apart at the end of a job; preset: as it was asked for."""
+    within = next((bound for bound in ACCURACY_BOUNDS if accuracy <= bound), None)
+    if within is not None:
+        count_one(session, ACCURACY_BUCKETS, f"{preset} {within}")
+    count_one(session, ACCURACY, preset, accuracy)
 
 
 class Counters:

@@ -9,7 +9,7 @@ from sqlalchemy import ColumnElement, and_, select, update
 from sqlalchemy.orm import Session
 
 from advtex_contract.jobs import STATES, JobState
-from advtex_store.counters import count_end
+from advtex_store.counters import count_accuracy, count_end
 from advtex_store.database import Database
 from advtex_store.errors import IllegalTransition, RecordNotFound, StaleAttempt
 from advtex_store.models import EventRow, JobRow
@@ -60,6 +60,9 @@ class Transitions:
         for name, value in values.items():
             setattr(row, name, value)
         count_end(session, row.state, row.error, row.progress.get("stage_seconds", {}))
+        accuracy = row.progress.get("losses", {}).get("accuracy")
+        if row.state == JobState.succeeded and accuracy is not None:
+            count_accuracy(session, row.options.get("preset", "auto"), accuracy)
         return row
 
     def _get(self, session: Session, job_id: str, owner: str | None, *, lock: bool = False) -> JobRow:

@@ -1,13 +1,16 @@
-"""The game along its run: both players' losses, and how far the texture is from what it has not seen.
+"""The game along its run: what the discriminator knows, and how far the texture is from what it has not seen.
 
-    python tests/benchmarks/game.py [SCAN …] [--errors cameras geometry] [--levels 2.75] [--scan-size 320x240]
-        [--steps 50000] [--points 10] [--change start=selection lr_texture=1e-4 …]
+    python tests/benchmarks/game.py [SCAN …] [--preset paper] [--errors cameras geometry] [--levels 2.75]
+        [--scan-size 320x240] [--steps 50000] [--points 10] [--change start=selection lr_texture=1e-4 …]
 
-The preset `paper`, changed as asked, on the scans of `paper.py`: a table per run, a line per point of it. Where the
-losses stand still, or one player is always ahead (`skipped` is the share of steps in which the discriminator is), the
-lines beside them say whether the texture is the better for it. The schedule is that of all the steps.
+A preset, changed as asked, on the scans of `paper.py`, refined where a run would refine them: a table per run, a line
+per point of it. Told apart are shares of the real and of the fake patches, since the reading before; margin, spread and
+the gradients' norms are those of `adversarial/game.py`. Where the losses stand still, the discriminator tells half of
+the patches apart, or it is always ahead (`skipped` is the share of steps in which it is), the columns beside them say
+whether the texture is the better for it. The schedule is that of all the steps.
 
-Writes game.json (one cell per point) and game.md below --results. A run that is stopped begins anew.
+Writes game.json (a cell per reading, READINGS of them per point), game.md and game.png below --results. A run that is
+stopped begins anew.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ import argparse
 import dataclasses
 import json
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,11 +41,13 @@ from harness import (
     started,
     write_report,
 )
+from matplotlib.figure import Figure
 from paper import FACES, HOLDOUT, SCAN_FACES, SCAN_SIZE, SIZE, TURN, VIEWS
 from study import make_scan
 from torch import Tensor
 
 from advtex_engine.adversarial.discriminator import PatchDiscriminator
+from advtex_engine.adversarial.game import CHANCE
 from advtex_engine.adversarial.optimizer import AdversarialOptimizer
 from advtex_engine.core.config import PRESETS, Preset, TextureConfig, resolve_preset
 from advtex_engine.methods import MethodInput
@@ -53,7 +58,16 @@ from advtex_engine.metrics.speckle import speckle_share
 from advtex_engine.render.texture import fill_holes
 from advtex_engine.runtime.devices import choose_device
 
+READINGS = 5
 TABLE = {
+    "accuracy": "told apart",
+    "accuracy_real": "real told",
+    "accuracy_fake": "fake told",
+    "margin": "margin",
+    "spread": "spread",
+    "gradient_adversarial": "gradient, adversarial",
+    "gradient_l1": "gradient, L1",
+    "gradient_features": "gradient, features",
     "discriminator": "discriminator's loss",
     "adversarial": "texture's loss",
     "l1": "L1",
@@ -66,6 +80,14 @@ TABLE = {
     "speckle": "speckled texels",
     "ms": "ms per step",
 }
+PANELS = {
+    "share told apart": ("accuracy", "accuracy_real", "accuracy_fake"),
+    "logits": ("margin", "spread"),
+    "norm of the texture's gradient": ("gradient_adversarial", "gradient_l1", "gradient_features"),
+    "LPIPS of held-out views": ("lpips", "lpips_corrected"),
+    "displacement, pixels": ("displacement_pixels",),
+    "energy where flat, gradient ratio": ("flat_energy", "gradient_ratio"),
+}
 
 
 def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
@@ -74,7 +96,8 @@ def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--errors", nargs="*", default=[], choices=["cameras", "geometry"])
     parser.add_argument("--levels", nargs="+", type=float, default=[2.75], help="n of the error's size")
     parser.add_argument("--scan-size", default=SCAN_SIZE, help="WIDTHxHEIGHT of the views of one's own scans")
-    parser.add_argument("--steps", type=int, default=PRESETS["paper"].steps)
+    parser.add_argument("--preset", default="paper", choices=[name for name in PRESETS if name != "preview"])
+    parser.add_argument("--steps", type=int, help="the preset's if not given")
     parser.add_argument("--points", type=int, default=10, help="at which the texture is scored")
     parser.add_argument("--change", nargs="*", default=[], metavar="NAME=VALUE", help="numbers of the preset")
     parser.add_argument("--device", default="auto")
@@ -106,7 +129,7 @@ def play(
     results: Results,
     settings: dict[str, Any],
 ) -> None:
-    """One run from the start; a cell per point."""
+    """One run from the start; a cell per reading, with the texture's scores at each point."""
     given = started(given)
     maps, preset, start = given.maps[1], given.preset, given.start
     assert start is not None
@@ -120,16 +143,21 @@ def play(
         generator=torch.Generator(maps.device).manual_seed(given.config.seed),
         discriminator=PatchDiscriminator(torch.Generator().manual_seed(given.config.seed)).to(maps.device),
     )
-    for point in range(points + 1):
-        end, watch, before = preset.steps * point // points, Stopwatch(), optimizer.index
+    ends = {preset.steps * point // points for point in range(points + 1)}
+    readings = {preset.steps * reading // (points * READINGS) for reading in range(points * READINGS + 1)}
+    for end in sorted(ends | readings):
+        watch, before, found = Stopwatch(), optimizer.index, dict[str, float]()
         while optimizer.index < end:
             optimizer.step()
-        losses = optimizer.drain_losses()
-        seconds = watch.seconds
-        texture = fill_holes(dense_texture(maps, optimizer.result).clamp(0, 1), maps.slot_map >= 0).cpu()
-        found = {**losses, **score(texture), "speckle": speckle_share(texture, maps.slot_map.cpu() >= 0) or 0.0}
         if end > before:
-            found["ms"] = 1000 * seconds / (end - before)
+            found = optimizer.drain_losses()
+            found["ms"] = 1000 * watch.seconds / (end - before)
+            found |= optimizer.gradient_norms()
+        seconds = watch.seconds
+        if end in ends:
+            texture = fill_holes(dense_texture(maps, optimizer.result).clamp(0, 1), maps.slot_map >= 0).cpu()
+            found |= score(texture)
+            found["speckle"] = speckle_share(texture, maps.slot_map.cpu() >= 0) or 0.0
         results.add({**settings, "step": end}, found, seconds)
 
 
@@ -152,7 +180,9 @@ def run(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
 
 
 def _settings(arguments: argparse.Namespace, scan: str, size: str) -> dict[str, Any]:
-    return {"scan": scan, "size": size, "steps": arguments.steps, "changes": " ".join(arguments.change)}
+    steps = arguments.steps or PRESETS[arguments.preset].steps
+    changed = " ".join(arguments.change)
+    return {"scan": scan, "size": size, "preset": arguments.preset, "steps": steps, "changes": changed}
 
 
 def _input(
@@ -160,7 +190,7 @@ def _input(
 ) -> MethodInput:
     device = choose_device(arguments.device)
     config = TextureConfig(
-        preset="paper",
+        preset=arguments.preset,
         steps=arguments.steps,
         size=parsed_size(size),
         holdout=holdout,
@@ -183,16 +213,39 @@ def _against_photographs(
 
 
 def report(arguments: argparse.Namespace, results: Results) -> None:
-    """game.md: a table per run, its points in order."""
+    """game.md: a table per run, its points in order; game.png: a row of curves per run."""
+    runs = dict[str, list[dict[str, Any]]]()
+    for cell in results.cells:
+        scan, size, preset, steps, changed, _ = cell["settings"].values()
+        title = f"{scan}, {size}, {preset}, {steps} steps" + (f", {changed}" if changed else "")
+        runs.setdefault(title, []).append(cell)
     body = ""
-    runs = dict.fromkeys(tuple(v for k, v in cell["settings"].items() if k != "step") for cell in results.cells)
-    for scan, size, steps, changed in runs:
-        wanted = {"scan": scan, "size": size, "steps": steps, "changes": changed}
-        here = [cell for cell in results.cells if wanted.items() <= cell["settings"].items()]
-        lines = [[cell["settings"]["step"], *(shown_mean([cell], name) for name in TABLE)] for cell in here]
-        title = f"{scan}, {size}, {steps} steps" + (f", {changed}" if changed else "")
+    for title, cells in runs.items():
+        scored = [cell for cell in cells if "speckle" in cell["scores"]]
+        lines = [[cell["settings"]["step"], *(shown_mean([cell], name) for name in TABLE)] for cell in scored]
         body += f"\n## {title}\n\n{markdown_table(['step', *TABLE.values()], lines)}"
     write_report(arguments.results / "game.md", "The game along its run", results.cells, body)
+    draw_curves(arguments.results / "game.png", runs)
+
+
+def draw_curves(path: Path, runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
+    """A PNG with a row of PANELS per run."""
+    figure = Figure(figsize=(3.2 * len(PANELS), 2.6 * len(runs)), layout="tight")
+    for row, (title, cells) in zip(figure.subplots(len(runs), len(PANELS), squeeze=False), runs.items(), strict=True):
+        row[0].set_ylabel(title.replace(", ", "\n", 1), fontsize=7)
+        row[0].set_ylim(0, 1)
+        row[0].axhspan(*CHANCE, color="0.9")
+        for place, (name, scores) in zip(row, PANELS.items(), strict=True):
+            for score in scores:
+                known = [cell for cell in cells if score in cell["scores"]]
+                steps = [cell["settings"]["step"] for cell in known]
+                values = [cell["scores"][score] for cell in known]
+                place.plot(steps, values, marker="o", markersize=2, linewidth=1, label=TABLE[score])
+            place.set_title(name, fontsize=8)
+            place.set_xlabel("step", fontsize=7)
+            place.tick_params(labelsize=6)
+            place.legend(fontsize=6)
+    figure.savefig(path, dpi=110)
 
 
 def main(line: list[str] | None = None) -> None:

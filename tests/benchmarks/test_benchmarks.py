@@ -259,15 +259,21 @@ def test_the_game_ends_where_the_run_ends(tmp_path: Path, weights: Path, monkeyp
     changed = ["--change", "start=selection", "lr_texture=1e-2"]
     for change in ([], changed):
         game.main([*line, "--points", "2", *change, "--results", str(tmp_path / "game")])
-    cells = json.loads((tmp_path / "game" / "game.json").read_text())["cells"]
+    readings = json.loads((tmp_path / "game" / "game.json").read_text())["cells"]
+    assert [cell["settings"]["step"] for cell in readings] == [0, 1, 2, 3, 4] * 4
+    for cell in readings:
+        assert ({"gradient_adversarial", "gradient_l1"} <= set(cell["scores"])) == (cell["settings"]["step"] > 0)
+    assert {"accuracy_real", "accuracy_fake", "margin", "spread"} <= set(readings[9]["scores"])
+    cells = [cell for cell in readings if "lpips" in cell["scores"]]
     assert [cell["settings"]["step"] for cell in cells] == [0, 2, 4] * 4
+    assert (tmp_path / "game" / "game.png").stat().st_size > 1000
     usual = [cell for cell in cells if not cell["settings"]["changes"]]
     assert [cell["scores"]["lpips"] for cell in usual] != [cell["scores"]["lpips"] for cell in cells[6:]]
     ends = {cell["settings"]["scan"]: cell["scores"] for cell in usual if cell["settings"]["step"] == 4}
     for cell in json.loads((tmp_path / "paper" / "paper.json").read_text())["cells"]:
         assert ends[cell["settings"]["scan"]]["lpips"] == pytest.approx(cell["scores"]["lpips"], abs=1e-6)
     page = (tmp_path / "game" / "game.md").read_text()
-    assert "## desk, 96x64, 4 steps, start=selection lr_texture=1e-2" in page
+    assert "## desk, 96x64, paper, 4 steps, start=selection lr_texture=1e-2" in page
     with pytest.raises(SystemExit, match="--change rate: the preset has no such number"):
         game.main([*line, "--change", "rate=1", "--results", str(tmp_path / "game")])
 

@@ -119,6 +119,13 @@ def test_a_run_leaves_models_previews_and_a_report(whole: tuple[Path, Recorder])
     report = json.loads((out / "report.json").read_text())
     assert [stage["stage"] for stage in report["stages"]] == list(WITH_MESH)
     assert report["losses"][-1]["step"] == STEPS
+    game = report["game"]
+    assert [point["at"] for point in game["points"]] == ["end of pretraining", "middle", "end"]
+    assert [point["step"] for point in game["curve"]] == curves["steps"]
+    for name in ("accuracy_real", "margin", "gradient_l1"):
+        assert curves["series"][name][-1] == pytest.approx(game["curve"][-1][name], rel=1e-4)
+        assert name not in report["losses"][-1], "told once"
+    assert curves["series"]["gradient_l1"][:-1] == [None] * (STEPS - 1)
     assert report["scan"]["heldout"] == sorted(report["scan"]["heldout"])
     assert len(report["scan"]["heldout"]) == 2
     assert report["scan"]["views"] == 10
@@ -172,6 +179,8 @@ def test_a_stopped_run_resumes_to_the_same_bytes_without_redoing_earlier_stages(
     assert first > 0.01
     assert optimization == pytest.approx(first + again.seconds["optimization"], abs=0.002)
     assert [point["step"] for point in report["losses"]] == list(range(1, STEPS + 1))
+    unbroken = json.loads((whole[0] / "report.json").read_text())
+    assert (report["losses"], report["game"]) == (unbroken["losses"], unbroken["game"])
 
 
 def test_without_resume_and_with_other_options_the_work_folder_is_not_used(scan: Path, tmp_path: Path) -> None:

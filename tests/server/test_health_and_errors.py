@@ -155,7 +155,8 @@ def test_metrics_of_the_fleet(make_live: Callable[..., Any], redis_url: str, sca
     jobs = [live.job(upload)["id"] for _ in range(3)]
     records = live.store.records
     records.claim(jobs[0], 1, "w")
-    records.heartbeat(jobs[0], 1, Progress(stage="atlas", steps_per_second=2.5, stage_seconds={"ingest": 4.0}))
+    progress = Progress(stage="atlas", steps_per_second=2.5, stage_seconds={"ingest": 4.0}, losses={"accuracy": 0.5})
+    records.heartbeat(jobs[0], 1, progress)
     records.claim(jobs[1], 1, "w")
     records.lost(jobs[1], 1)
     records.claim(jobs[1], 2, "w")
@@ -173,6 +174,9 @@ def test_metrics_of_the_fleet(make_live: Callable[..., Any], redis_url: str, sca
     assert 'advtex_stage_seconds_count{stage="ingest"} 1.0' in told
     assert 'advtex_stage_seconds_sum{stage="ingest"} 4.0' in told
     assert 'advtex_jobs_ended_total{state="succeeded"} 1.0' in told
+    preset = records.job(jobs[0]).options["preset"]
+    accuracy = f'advtex_discriminator_accuracy_bucket{{le="%s",preset="{preset}"}} %s'
+    assert {accuracy % ("0.45", "0.0"), accuracy % ("0.55", "1.0"), accuracy % ("+Inf", "1.0")} <= set(told)
 
 
 def test_jobs_that_wait_are_told_by_the_class_that_they_need(make_live: Callable[..., Any], scan_zip: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 from sqlalchemy import update
 
 from advtex_contract.jobs import JobError, JobState, Progress
-from advtex_store.counters import STAGE_BUCKETS, Counters, Line, RunningJob
+from advtex_store.counters import ACCURACY, ACCURACY_BUCKETS, STAGE_BUCKETS, Counters, Line, RunningJob
 from advtex_store.models import JobRow
 from advtex_store.webhooks import Webhooks
 
@@ -56,3 +56,23 @@ def test_times_in_stages_are_counted_by_the_bound_that_they_stay_below(bench: An
         bench.records.fail(job, 1, JobError(code="engine_error", message="no"))
     rows = [row for row in Counters(bench.database).counts() if row.name == STAGE_BUCKETS]
     assert {row.label: row.count for row in rows} == {"atlas 1": 1, "atlas 3": 1}
+
+
+def test_what_discriminators_told_apart_at_the_end_is_counted_by_preset(bench: Any) -> None:
+    for accuracy, ends in ((0.5, True), (0.56, True), (0.97, False), (None, True)):
+        job = bench.job()
+        bench.records.claim(job, 1, "w")
+        losses = {"l1": 0.1} | ({} if accuracy is None else {"accuracy": accuracy})
+        bench.records.heartbeat(job, 1, Progress(stage="previews", losses=losses))
+        if ends:
+            bench.records.succeed(job, 1, [])
+        else:
+            bench.records.fail(job, 1, JobError(code="engine_error", message="no"))
+    counts = Counters(bench.database).counts()
+    preset = bench.records.job(job).options["preset"]
+    assert {row.label: row.count for row in counts if row.name == ACCURACY_BUCKETS} == {
+        f"{preset} 0.55": 1,
+        f"{preset} 0.6": 1,
+    }
+    (row,) = [row for row in counts if row.name == ACCURACY]
+    assert (row.label, row.count, round(row.total, 6)) == (preset, 2, 1.06)

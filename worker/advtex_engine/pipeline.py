@@ -100,7 +100,7 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
         budget.folder.earlier_seconds = given.work.earlier_seconds
     if not bool(texture.isfinite().all()):
         raise Diverged(f"the texture of the method {config.method} is not finite everywhere; choose another method")
-    memory = budget.report(work, stages.records[-1])
+    memory, game = budget.report(work, stages.records[-1]), given.facts.get("game")
     touched, mean = maps[1].slot_map >= 0, given.means[1]
     with stages.run("dilation"):
         seen = touched & given.facts.get("known", touched)
@@ -117,7 +117,8 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
         if "tiles" in outputs:
             files += (write_tiles(out, atlas, texture, up_axis=scene.up_axis),)
     with stages.run("previews"):
-        files += write_gallery(out, scene, atlas, texture, mean, curves(losses, given.live.quality), completed.state)
+        told = curves(losses, given.live.quality, game["curve"] if game else ())
+        files += write_gallery(out, scene, atlas, texture, mean, told, completed.state)
         atlas = replace(atlas, mesh=atlas.mesh.to(torch.device("cpu")))
         scores = heldout_scores(scene, atlas, texture.cpu(), mean.cpu())
     parts = {
@@ -133,6 +134,7 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
         "step": given.facts.get("step"),
         "memory": memory,
         "losses": losses,
+        "game": game,
         "heldout": scores,
     }
     report = assembled(config, given.preset, budget.device, budget.monitor.warnings, parts)

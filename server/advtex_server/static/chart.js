@@ -4,8 +4,13 @@ import { count, el } from "./base.js";
 
 const TITLES = {
   l1: "L1 loss", adversarial: "Adversarial loss", discriminator: "Discriminator loss", psnr: "PSNR (dB)",
-  gradient_ratio: "Gradient ratio",
+  gradient_ratio: "Gradient ratio", accuracy: "Patches told apart (share)", accuracy_real: "Real patches told (share)",
+  accuracy_fake: "Fake patches told (share)",
+  margin: "Margin (real − fake logits)", spread: "Spread of the logits", gradient_adversarial: "Gradient, adversarial",
+  gradient_l1: "Gradient, L1", gradient_features: "Gradient, features",
 };
+// Drawn whole: noise about one half must not look like a curve.
+const WHOLE = { accuracy: [0, 1], accuracy_real: [0, 1], accuracy_fake: [0, 1] };
 const [WIDTH, HEIGHT, PAD] = [300, 110, 6];
 
 const short = (value) => (Math.abs(value) >= 100 ? value.toFixed(0) : Number(value.toPrecision(3)).toString());
@@ -14,7 +19,8 @@ function chart(name, steps, values) {
   const points = steps.map((step, index) => [step, values[index]]).filter(([, value]) => value != null);
   const heights = points.map(([, value]) => value);
   if (points.length < 2 || heights.every((value) => value === 0)) return null; // a part that this method does without
-  const [low, high] = [Math.min(...heights), Math.max(...heights)];
+  const [least, most] = [Math.min(...heights), Math.max(...heights)];
+  const [low, high] = WHOLE[name] ?? [least, most];
   const [first, last] = [points[0][0], points.at(-1)[0]];
   const x = (step) => (WIDTH * (step - first)) / (last - first || 1);
   const y = (value) => PAD + (HEIGHT - 2 * PAD) * (1 - (value - low) / (high - low || 1));
@@ -30,7 +36,7 @@ function chart(name, steps, values) {
     el("div", { class: "top" }, el("strong", {}, title), el("span", {}, short(heights.at(-1)))),
     drawing,
     el("div", { class: "ends" }, el("span", {}, `step ${count(first)}`),
-      el("span", {}, `${short(low)} – ${short(high)}`), el("span", {}, count(last))));
+      el("span", {}, `${short(least)} – ${short(most)}`), el("span", {}, count(last))));
 }
 
 /** Draws `curves.json` into a section; hides it while there is nothing to draw. */

@@ -46,10 +46,13 @@ function running() {
   const name = stage ? stageName(stage) : "Starting";
   const numbers = [steps ? `step ${count(step)} of ${count(steps)}` : null, rate && `${rate.toPrecision(3)} steps/s`,
     eta != null && `${duration(eta)} left`].filter(Boolean).join(" · ");
-  const shown = Object.entries(losses).filter(([, value]) => value); // no parts that are switched off
+  const { accuracy, ...others } = losses;
+  const shown = Object.entries(others).filter(([, value]) => value) // no parts that are switched off
+    .map(([loss, value]) => `${loss.replaceAll("_", " ")} ${value.toPrecision(3)}`);
+  if (accuracy != null) shown.push(`tells ${Math.round(100 * accuracy)} % of patches apart`);
   return [
     el("div", { class: "line" }, el("strong", {}, name), el("span", { class: "num" }, numbers)), meter(step, steps, name), stageLine(),
-    shown.length > 0 && el("p", { class: "hint num" }, shown.map(([loss, value]) => `${loss.replaceAll("_", " ")} ${value.toPrecision(3)}`).join(" · ")),
+    shown.length > 0 && el("p", { class: "hint num" }, shown.join(" · ")),
   ];
 }
 

@@ -199,13 +199,18 @@ def test_the_players_are_judged_as_by_torch(
     )
     shares[:, 0, :5] *= 0.15
     for strength in (0.1, 30.0):  # the texture is ahead, and the discriminator
+        shares[:, :, 6, :3] = 1  # where a logit is 0 below
         logits = strength * (torch.rand((2, 17, 23), generator=generator).to(DEVICE) - 0.5)
         logits += strength * torch.tensor([0.6, -0.6], device=DEVICE).view(2, 1, 1)
+        logits[:, 6, 1] = 0
         pairs = [[one[None, None].to(dtype).requires_grad_() for one in logits] for _ in range(2)]
         ours, plain = fused_losses.judge(*pairs[0], shares, waits), losses.judge(*pairs[1], shares, waits)
         for name in ("discriminator", "adversarial", "ahead"):
             torch.testing.assert_close(getattr(ours, name), getattr(plain, name), atol=1e-5, rtol=1e-5)
         assert float(plain.ahead) == (strength > 1) * (1 - pretraining)
+        assert not ours.told.requires_grad
+        torch.testing.assert_close(ours.told, plain.told, atol=1e-3, rtol=1e-5)
+        assert torch.equal(ours.told[:3], plain.told[:3])
         for name in ("discriminator", "adversarial"):
             found, wanted = (
                 torch.autograd.grad(3 * getattr(of, name), pair, retain_graph=True, allow_unused=True)
@@ -375,7 +380,7 @@ TYPES = {
     "sample_backward": "fp32 i32 fp32 fp32",
     "assemble": "fp32 fp32 fp32 fp32 fp32 bf16 bf16 fp32 fp32 fp32",
     "assemble_backward": "bf16 fp32 fp32 fp32 fp32",
-    "judge": "bf16 bf16 fp32 fp32 fp32 fp32 fp32 fp32",
+    "judge": "bf16 bf16 fp32 fp32 fp32 fp32 fp32 fp32 fp32",
     "judge_backward": "bf16 bf16 fp32 fp32 fp32 fp32 bf16 bf16",
     "l1": "fp32 fp32 fp32 fp32",
     "l1_mean": "fp32 fp32 fp32",

@@ -179,7 +179,10 @@ def test_losses_are_means_since_the_last_call() -> None:
     of.step()
     of.step()
     first = of.drain_losses()
-    assert set(first) == {"discriminator", "adversarial", "l1", "features", "skipped"}
+    assert set(first) == {
+        *("discriminator", "adversarial", "l1", "features", "skipped"),
+        *("accuracy", "accuracy_real", "accuracy_fake", "margin", "spread"),
+    }
     assert first["discriminator"] == pytest.approx(2 * 0.693, abs=0.05)
     assert of.drain_losses() == {}
 

@@ -46,17 +46,29 @@ def judge(
     of_texture,
     ahead,
     counts,
+    told,
     COUNT: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Both players' losses over all logits, in one program; `losses.judge`.
+    """Both players' losses over all logits, and what they tell apart, in one program; `losses.judge`.
 
     real, fake: [COUNT] any float, logits. shares: [2,COUNT] float32. pretraining: 0-dim float32, 1 or 0.
     Written: of_discriminator, of_texture, 0-dim float32, the losses; ahead, 0-dim float32, 1 where the discriminator is
-    ahead; counts [2] float32, how many logits count for discriminator and texture, at least 1.
+    ahead; counts [2] float32, how many logits count for discriminator and texture, at least 1; told [7] float32, the
+    sums of `losses.told_apart`.
     """
     lost, fooled, judged, drawn = (
         tl.zeros((BLOCK,), tl.float32),
+        tl.zeros((BLOCK,), tl.float32),
+        tl.zeros((BLOCK,), tl.float32),
+        tl.zeros((BLOCK,), tl.float32),
+    )
+    real_right, real_sum, real_squares = (
+        tl.zeros((BLOCK,), tl.float32),
+        tl.zeros((BLOCK,), tl.float32),
+        tl.zeros((BLOCK,), tl.float32),
+    )
+    fake_right, fake_sum, fake_squares = (
         tl.zeros((BLOCK,), tl.float32),
         tl.zeros((BLOCK,), tl.float32),
         tl.zeros((BLOCK,), tl.float32),
@@ -71,6 +83,12 @@ def judge(
         fooled += softplus(-of_fake) * texture
         judged += discriminator
         drawn += texture
+        real_right += tl.where(of_real > 0, 1.0, tl.where(of_real < 0, 0.0, 0.5)) * discriminator
+        fake_right += tl.where(of_fake < 0, 1.0, tl.where(of_fake > 0, 0.0, 0.5)) * discriminator
+        real_sum += of_real * discriminator
+        fake_sum += of_fake * discriminator
+        real_squares += of_real * of_real * discriminator
+        fake_squares += of_fake * of_fake * discriminator
     first_count, second_count = tl.maximum(tl.sum(judged, 0), 1.0), tl.maximum(tl.sum(drawn, 0), 1.0)
     first_loss, second_loss = tl.sum(lost, 0) / first_count, tl.sum(fooled, 0) / second_count
     tl.store(of_discriminator, first_loss)
@@ -78,6 +96,13 @@ def judge(
     tl.store(ahead, tl.where(first_loss <= second_loss, 1.0 - tl.load(pretraining), 0.0))
     tl.store(counts, first_count)
     tl.store(counts + 1, second_count)
+    tl.store(told, tl.sum(judged, 0))
+    tl.store(told + 1, tl.sum(real_right, 0))
+    tl.store(told + 2, tl.sum(fake_right, 0))
+    tl.store(told + 3, tl.sum(real_sum, 0))
+    tl.store(told + 4, tl.sum(fake_sum, 0))
+    tl.store(told + 5, tl.sum(real_squares, 0))
+    tl.store(told + 6, tl.sum(fake_squares, 0))
 
 
 @triton.jit

@@ -60,25 +60,43 @@ def adversarial_loss(fake: Tensor, mask: Tensor) -> Tensor:
     return masked_mean(F.softplus(-fake), mask)
 
 
+TOLD = 7
+
+
+def told_apart(real: Tensor, fake: Tensor, mask: Tensor) -> Tensor:
+    """Sums over the discriminator's patches, [TOLD] float32, which say what it knows (`game.knowledge`); no gradient.
+
+    real, fake: logits [1,1,h,w] float32; mask: [1,1,h,w], 1 or 0. In this order: the patches that count; of the real
+    and of the fake ones those judged rightly, a logit of 0 being half right; their logits; their logits' squares.
+    """
+    real, fake = real.detach(), fake.detach()
+    right = (1 + torch.cat((real, -fake)).sign()) / 2
+    logits = torch.cat((real, fake))
+    sums = (torch.stack((right, logits, logits.square())) * mask).sum((-3, -2, -1))
+    return torch.cat((mask.sum().view(1), sums.flatten()))
+
+
 @dataclass(frozen=True)
 class Verdict:
-    """0-dim tensors: both players' losses, and 1 where the discriminator is ahead, else 0."""
+    """0-dim tensors: both players' losses, and 1 where the discriminator is ahead, else 0. told: of `told_apart`."""
 
     discriminator: Tensor
     adversarial: Tensor
     ahead: Tensor
+    told: Tensor
 
 
 def judge(real: Tensor, fake: Tensor, shares: Tensor, pretraining: Tensor) -> Verdict:
-    """Both losses of the logits [1,1,h,w] of any type. shares: `example_shares`. pretraining: 0-dim, 1 or 0.
+    """Both losses of the logits [1,1,h,w] of any type, and what they tell apart.
 
-    The discriminator is ahead where its loss is not above the texture's; while it learns alone it never is.
+    shares: `example_shares`. pretraining: 0-dim, 1 or 0. The discriminator is ahead where its loss is not above the
+    texture's; while it learns alone it never is.
     """
     masks, real, fake = _masks(shares), real.float(), fake.float()
     of_discriminator = discriminator_loss(real, fake, masks.discriminator)
     adversarial = adversarial_loss(fake, masks.texture)
     ahead = (of_discriminator <= adversarial).to(torch.float32).detach() * (1 - pretraining)
-    return Verdict(of_discriminator, adversarial, ahead)
+    return Verdict(of_discriminator, adversarial, ahead, told_apart(real, fake, masks.discriminator))
 
 
 def l1_loss(fake: Tensor, real: Tensor, seen: Tensor) -> Tensor:

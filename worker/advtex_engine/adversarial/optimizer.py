@@ -25,7 +25,8 @@ from advtex_engine.adversarial.alignment import BLOCK, search_bound
 from advtex_engine.adversarial.backend import choose_operations
 from advtex_engine.adversarial.discriminator import MIN_SIZE, PatchDiscriminator
 from advtex_engine.adversarial.examples import Examples, InputForm
-from advtex_engine.adversarial.losses import example_shares, feature_loss
+from advtex_engine.adversarial.game import knowledge
+from advtex_engine.adversarial.losses import TOLD, example_shares, feature_loss
 from advtex_engine.adversarial.operations import Operations, plain_operations
 from advtex_engine.adversarial.pair_sampler import DrawnPair, PairSampler
 from advtex_engine.adversarial.schedule import Schedule
@@ -41,13 +42,17 @@ LOSS_NAMES = ("discriminator", "adversarial", "l1", "features", "skipped")
 
 @dataclass(frozen=True)
 class Losses:
-    """0-dim tensors: both players' losses, the L1 and feature terms, and 1 where the discriminator is ahead."""
+    """0-dim tensors: both players' losses, the L1 and feature terms, and 1 where the discriminator is ahead.
+
+    told: [TOLD], what it tells apart, as `losses.told_apart` has it.
+    """
 
     discriminator: Tensor
     adversarial: Tensor
     l1: Tensor
     features: Tensor
     ahead: Tensor
+    told: Tensor
 
 
 def native_bfloat16(device: torch.device) -> bool:
@@ -112,7 +117,7 @@ class AdversarialOptimizer:
         self.form = InputForm(8 if on_gpu else 6, dtype, preset.condition)
         perturbation = preset.perturbation * maps.width
         self.sampler = PairSampler(maps, pairs, kind, self.crop, generator, perturbation)
-        self._sums = torch.zeros(len(LOSS_NAMES), device=device)
+        self._sums = torch.zeros(len(LOSS_NAMES) + TOLD, device=device)
         self._summed = 0
         if operations is None and self.operations.name != "torch":
             self._try_operations()
@@ -183,7 +188,7 @@ class AdversarialOptimizer:
             self.update_texture(gradient)
             self._take_average()
         named = (losses.discriminator, losses.adversarial, losses.l1, losses.features, losses.ahead)
-        self._sums += torch.stack(named).detach()
+        self._sums += torch.cat((torch.stack(named).detach(), losses.told))
 
     def count(self, steps: int) -> None:
         """Tells the host of steps that the device was given."""
@@ -205,7 +210,7 @@ class AdversarialOptimizer:
         features = torch.zeros_like(l1)
         if self.preset.feature_weight:
             features = feature_loss(of_fake, of_real, self.operations.mean_difference)
-        return Losses(verdict.discriminator, verdict.adversarial, l1, features, verdict.ahead)
+        return Losses(verdict.discriminator, verdict.adversarial, l1, features, verdict.ahead, verdict.told)
 
     def _l1(self, pair: DrawnPair, fake: Tensor, shown: Examples) -> Tensor:
         """L1 of the render [1,3,h,w] to what the preset names."""
@@ -265,20 +270,45 @@ class AdversarialOptimizer:
         return of_fake
 
     def drain_losses(self) -> dict[str, float]:
-        """Means since the last call (waits for the device); empty when no step was taken."""
+        """Means since the last call, and what the discriminator knew (`knowledge`); empty when no step was taken.
+
+        Waits for the device.
+        """
         if self._summed == 0:
             return {}
-        means = (self._sums / self._summed).tolist()
+        sums = self._sums.tolist()
+        means = {name: total / self._summed for name, total in zip(LOSS_NAMES, sums[:-TOLD], strict=True)}
         self._sums.zero_()
         self._summed = 0
-        return dict(zip(LOSS_NAMES, means, strict=True))
+        return means | knowledge(sums[-TOLD:])
+
+    def gradient_norms(self) -> dict[str, float]:
+        """L2 norms, by the names of `game`, of what each term adds to the texture's gradient, its weight included.
+
+        For the pair that the next step will draw. Changes nothing, the generator included; waits for the device. A pass
+        forward and one back for each term: more than a step, and never part of a captured one.
+        """
+        before = self.generator.get_state()
+        losses = self.play(self.draw())
+        self.generator.set_state(before)
+        terms = {
+            "gradient_adversarial": (1.0, losses.adversarial),
+            "gradient_l1": (self.schedule.l1_weight_at(self.index), losses.l1),
+            "gradient_features": (self.preset.feature_weight, losses.features),
+        }
+        norms = {
+            name: weight * torch.autograd.grad(term, [self.values], retain_graph=True)[0].norm()
+            for name, (weight, term) in terms.items()
+            if weight
+        }
+        return dict(zip(norms, torch.stack(list(norms.values())).tolist(), strict=True))
 
     def finite(self) -> bool:
         """Whether the texture and the discriminator are (waits for the device)."""
         return bool(torch.stack([part.isfinite().all() for part in (self.values, *self.parameters)]).all())
 
     def state_dict(self) -> dict[str, Any]:
-        """All that decides the remaining steps."""
+        """All that decides the remaining steps and what is read out after them."""
         state: dict[str, Any] = {
             "index": self.index,
             "values": self.values.detach(),
@@ -286,6 +316,8 @@ class AdversarialOptimizer:
             "adam_texture": self.adam_texture.state_dict(),
             "adam_discriminator": self.adam_discriminator.state_dict(),
             "generator": self.generator.get_state(),
+            "sums": self._sums,
+            "summed": self._summed,
         }
         if self.start is not None:
             state["start"] = self.start
@@ -307,6 +339,8 @@ class AdversarialOptimizer:
         _load_adam(self.adam_texture, state["adam_texture"])
         _load_adam(self.adam_discriminator, state["adam_discriminator"])
         restore_generator(self.generator, state["generator"], self.index)
+        self._sums.copy_(state["sums"])
+        self._summed = int(state["summed"])
 
 
 def _adam(parameters: list[Any], lr: Tensor, beta1: float) -> torch.optim.Adam:

@@ -23,21 +23,21 @@ class _Judge(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, real: Tensor, fake: Tensor, shares: Tensor, pretraining: Tensor) -> tuple[Tensor, ...]:
         of_discriminator, of_texture, ahead = (torch.empty((), device=fake.device) for _ in range(3))
-        counts = torch.empty(2, device=fake.device)
+        counts, told = torch.empty(2, device=fake.device), torch.empty(losses.TOLD, device=fake.device)
         kernels.judge[(1,)](
-            *(real, fake, shares, pretraining, of_discriminator, of_texture, ahead, counts),
+            *(real, fake, shares, pretraining, of_discriminator, of_texture, ahead, counts, told),
             COUNT=fake.numel(),
             BLOCK=ALONE,
         )
         ctx.save_for_backward(real, fake, shares, counts)
         ctx.set_materialize_grads(False)  # of the two losses one has a gradient at a time
-        ctx.mark_non_differentiable(ahead)
-        return of_discriminator, of_texture, ahead
+        ctx.mark_non_differentiable(ahead, told)
+        return of_discriminator, of_texture, ahead, told
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> tuple[Tensor | None, ...]:
         real, fake, shares, counts = ctx.saved_tensors
-        of_discriminator, of_texture, _ = grads
+        of_discriminator, of_texture, _, _ = grads
         into_fake = torch.empty_like(fake)
         into_real = None if of_discriminator is None else torch.empty_like(real)
         kernels.judge_backward[_programs(fake.numel())](

@@ -14,7 +14,8 @@ from torch import Tensor
 from advtex_engine.adversarial.cuda_graph import Stepper
 from advtex_engine.adversarial.disagreement import disagreement
 from advtex_engine.adversarial.discriminator import PatchDiscriminator
-from advtex_engine.adversarial.optimizer import AdversarialOptimizer
+from advtex_engine.adversarial.game import GAME_NAMES, problems, recent_accuracy, summary
+from advtex_engine.adversarial.optimizer import LOSS_NAMES, AdversarialOptimizer
 from advtex_engine.core.config import Preset
 from advtex_engine.core.errors import Diverged, Problem, Stopped
 from advtex_engine.methods.inputs import LossPoint, MethodInput
@@ -26,12 +27,18 @@ from advtex_engine.runtime.checkpoint import Checkpoints
 
 NEEDED = ("level", "step", "losses", "quality", "halved", "optimizer", "views")
 """What a checkpoint holds."""
-HISTORY_POINTS = 200  # loss means kept for the report and shown as progress
+HISTORY_POINTS = 200  # means kept for the report and shown as progress
+PROBE_EVERY = 200
+"""Steps between two looks at each term's gradient, which cost a step and a quarter each."""
+PROBE_EVERY_ON_GPU = 2_000  # there a step is one of many of a graph, and a look is not: it costs ten times as much
 
 
 @dataclass
 class _Run:
-    """Where the run stands: pyramid level, global step, losses so far, and whether it goes at half the rates."""
+    """Where the run stands: pyramid level, global step, the history so far, and whether it goes at half the rates.
+
+    losses: means, and what the discriminator knew, since the point before.
+    """
 
     level: int
     step: int
@@ -42,7 +49,8 @@ class _Run:
 def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     """Optimizes the texture; goes on from the work folder's checkpoint when there is one.
 
-    Returns the dense texture [H,W,3] float32 in [0,1] and the loss history. Raises Stopped, after a checkpoint, when
+    Returns the dense texture [H,W,3] float32 in [0,1] and the loss history; what the discriminator knew is the fact
+    "game", and a warning where that was no help to the texture. Raises Stopped, after a checkpoint, when
     the monitor asks for it. On a CPU the result does not depend on whether and where the run was interrupted. A run
     that diverges goes back to its last checkpoint once, with half the learning rates, and warns; then Diverged.
     """
@@ -113,7 +121,11 @@ def _optimized(
         texture = _refined(start, dense_texture(maps, optimizer.result))
         del optimizer, views  # before the next level makes its own
         run.level = number + 1
-    return texture.clamp(0, 1), run.losses
+    given.facts["game"] = summary(run.losses, preset)
+    for problem in problems(run.losses, preset):
+        given.monitor.warning(problem)
+    losses = [{name: value for name, value in point.items() if name not in GAME_NAMES} for point in run.losses]
+    return texture.clamp(0, 1), losses
 
 
 def adversarial_no_auxiliary(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
@@ -151,6 +163,7 @@ def _run_level(
 ) -> None:
     total = given.preset.steps
     every = max(1, total // HISTORY_POINTS)
+    probe_every = PROBE_EVERY_ON_GPU if optimizer.device.type == "cuda" else PROBE_EVERY
     stepper = Stepper(optimizer)
     while run.step < end:
         before = run.step
@@ -159,8 +172,11 @@ def _run_level(
         if run.step // every > before // every or run.step == end:
             losses = optimizer.drain_losses()
             _check(optimizer, losses, run, total)
+            read = run.losses[-1]["step"] if run.losses else 0
+            if run.step // probe_every > read // probe_every or run.step == total:
+                losses |= optimizer.gradient_norms()
             run.losses.append({"step": run.step, **losses})
-            given.monitor.progress(run.step, total, losses)
+            given.monitor.progress(run.step, total, _shown(run.losses, total))
         if run.step == total or given.live.due():
             mean = given.means[given.preset.levels[run.level].scale]
             given.live.show(run.step, optimizer.maps, optimizer.result, mean, run.losses)
@@ -173,6 +189,13 @@ def _run_level(
         if stop:
             raise Stopped(f"stopped after step {run.step} of {total}; resume goes on from there")
     given.facts["step"] = stepper.describe() | {"lr_texture": optimizer.preset.lr_texture}
+
+
+def _shown(history: Sequence[LossPoint], total: int) -> dict[str, float]:
+    """The newest losses, and what share of patches the discriminator has told apart of late."""
+    newest = {name: history[-1][name] for name in LOSS_NAMES}
+    recent = recent_accuracy(history, total)
+    return newest if recent is None else newest | {"accuracy": recent}
 
 
 def _check(optimizer: AdversarialOptimizer, losses: Mapping[str, float], run: _Run, total: int) -> None:

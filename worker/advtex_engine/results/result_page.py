@@ -15,7 +15,7 @@ from advtex_engine.results.viewer_files import write_viewer
 from advtex_engine.runtime.files import json_text, write_atomically
 
 TEMPLATE = Path(__file__).with_name("result_page.html")
-LEFT_OUT = ("losses",)  # of the report: the curves have them
+LEFT_OUT = ("losses", "game")  # of the report: the curves have them
 
 
 def write_page(out: Path, report: Mapping[str, Any], files: Sequence[Path]) -> tuple[Path, ...]:
@@ -28,6 +28,7 @@ def write_page(out: Path, report: Mapping[str, Any], files: Sequence[Path]) -> t
         "manifest": json.loads((previews / "manifest.json").read_bytes()),
         "curves": json.loads((previews / "curves.json").read_bytes()),
         "report": {name: part for name, part in report.items() if name not in LEFT_OUT},
+        "game": (report.get("game") or {}).get("points", []),
         "files": [file.name for file in files if file.parent == out],
         "viewer": {file.name: file.stat().st_size for file in viewer},
     }

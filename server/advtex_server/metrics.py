@@ -18,7 +18,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from advtex_contract.jobs import STATES, WAITING, JobState
 from advtex_server.loops import Loop
-from advtex_store.counters import ATTEMPTS, FAILURES, JOBS, STAGE_BOUNDS, STAGE_BUCKETS, STAGES, Line
+from advtex_store.counters import ATTEMPTS, BYTES, FAILURES, JOBS, MOVES, STAGE_BOUNDS, STAGE_BUCKETS, STAGES, Line
 from advtex_store.fleet import LivingWorker
 from advtex_store.models import CounterRow
 from advtex_store.store import Store
@@ -221,6 +221,7 @@ def _so_far(counts: Iterable[CounterRow]) -> Iterable[Metric]:
         JOBS: CounterMetricFamily("advtex_jobs_ended", "Jobs that ended, by state", labels=["state"]),
     }
     found = {name: Tally(dict.fromkeys(labels, 0)) for name, labels in LABELS.items()}
+    moved = dict.fromkeys(MOVES, 0.0)
     within, spent = defaultdict[str, Tally[int]](Tally), list[CounterRow]()
     for row in counts:
         if row.name == STAGES:
@@ -228,6 +229,8 @@ def _so_far(counts: Iterable[CounterRow]) -> Iterable[Metric]:
         elif row.name == STAGE_BUCKETS:
             stage, _, bound = row.label.rpartition(" ")
             within[stage][int(bound)] = row.count
+        elif row.name == BYTES and row.label in moved:
+            moved[row.label] = row.total
         elif row.name in families:
             found[row.name][row.label] = row.count
     for name, labels in found.items():
@@ -242,7 +245,14 @@ def _so_far(counts: Iterable[CounterRow]) -> Iterable[Metric]:
         ]
         # Releases that know no buckets count the rest.
         stages.add_metric([row.label], [*buckets, ("+Inf", float(row.count))], row.total)
+    labels = ["direction", "what"]
+    bytes_moved = CounterMetricFamily(
+        "advtex_worker_bytes", "Bytes that workers moved from and to storage", labels=labels
+    )
+    for move, size in moved.items():
+        bytes_moved.add_metric(move.split(), size)
     yield from families.values()
+    yield bytes_moved
     yield stages
 
 

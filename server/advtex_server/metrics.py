@@ -245,14 +245,13 @@ def _so_far(counts: Iterable[CounterRow]) -> Iterable[Metric]:
         ]
         # Releases that know no buckets count the rest.
         stages.add_metric([row.label], [*buckets, ("+Inf", float(row.count))], row.total)
-    labels = ["direction", "what"]
-    bytes_moved = CounterMetricFamily(
-        "advtex_worker_bytes", "Bytes that workers moved from and to storage", labels=labels
+    traffic = CounterMetricFamily(
+        "advtex_worker_bytes", "Bytes between workers and the storage", labels=["direction", "what"]
     )
     for move, size in moved.items():
-        bytes_moved.add_metric(move.split(), size)
+        traffic.add_metric(move.split(), size)
     yield from families.values()
-    yield bytes_moved
+    yield traffic
     yield stages
 
 

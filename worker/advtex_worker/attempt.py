@@ -119,9 +119,9 @@ class Attempt:
                 self._run()
         except Interrupted:
             self._give_back()
-        except ResultsUnreadable as error:
-            damage = error
-            self._patience.record(lambda: self._store.results.end_unread(self._job_id, self._number, damage))
+        except ResultsUnreadable as damage:
+            told = damage  # the name of an exception ends with its clause
+            self._patience.record(lambda: self._store.results.end_unread(self._job_id, self._number, told))
         except Refused as refused:
             error = JobError(code="storage_refused", message=str(refused), log_tail=self._log_tail())
             self._patience.record(lambda: self._store.records.fail(self._job_id, self._number, error))

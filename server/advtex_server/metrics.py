@@ -23,8 +23,10 @@ from advtex_store.counters import (
     ACCURACY_BOUNDS,
     ACCURACY_BUCKETS,
     ATTEMPTS,
+    BYTES,
     FAILURES,
     JOBS,
+    MOVES,
     STAGE_BOUNDS,
     STAGE_BUCKETS,
     STAGES,
@@ -233,13 +235,22 @@ def _so_far(counts: Iterable[CounterRow]) -> Iterable[Metric]:
     }
     found = {name: Tally(dict.fromkeys(labels, 0)) for name, labels in LABELS.items()}
     counts = list(counts)
+    moved = dict.fromkeys(MOVES, 0.0)
     for row in counts:
-        if row.name in families:
+        if row.name == BYTES and row.label in moved:
+            moved[row.label] = row.total
+        elif row.name in families:
             found[row.name][row.label] = row.count
     for name, labels in found.items():
         for label, count in sorted(labels.items()):
             families[name].add_metric([label], count)
+    traffic = CounterMetricFamily(
+        "advtex_worker_bytes", "Bytes between workers and the storage", labels=["direction", "what"]
+    )
+    for move, size in moved.items():
+        traffic.add_metric(move.split(), size)
     yield from families.values()
+    yield traffic
     stages = HistogramMetricFamily("advtex_stage_seconds", "Time in stages, of jobs that ended", labels=["stage"])
     yield _filled(stages, counts, STAGES, STAGE_BUCKETS, STAGE_BOUNDS)
     accuracy = HistogramMetricFamily(

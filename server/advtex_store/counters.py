@@ -17,6 +17,7 @@ from advtex_store.models import KEPT, WAITS_IN_LINE, CounterRow, DeliveryRow, Jo
 
 # In the order in which one transaction may count: all in the same, or two of them could wait for each other.
 ATTEMPTS = "attempts"  # ended early, by how: lost, preempted
+BYTES = "bytes"  # that workers moved, by direction and what: `down scan`; counts are of transfers
 FAILURES = "failures"  # jobs that failed or were rejected, by the error's code
 JOBS = "jobs"  # ended, by state
 STAGE_BUCKETS = "stage_buckets"  # the same times, counted by stage and the bound that they stay below: `atlas 30`
@@ -24,6 +25,8 @@ STAGES = "stages"  # seconds, of jobs that ended
 ACCURACY_BUCKETS = "accuracy_buckets"  # the same shares as below, by preset and bound: `standard 0.55`
 ACCURACY = "accuracy"  # of patches that a discriminator told apart at the end of a job that succeeded, by preset
 
+SCAN_DOWN, CHECKPOINT_DOWN, CHECKPOINT_UP, RESULT_UP = "down scan", "down checkpoint", "up checkpoint", "up result"
+MOVES = (SCAN_DOWN, CHECKPOINT_DOWN, CHECKPOINT_UP, RESULT_UP)
 STAGE_BOUNDS = (1, 3, 10, 30, 60, 180, 600, 1800, 3600, 10_800, 36_000)  # seconds
 ACCURACY_BOUNDS = (0.45, 0.55, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)  # it guesses up to .55, and is certain above .95
 

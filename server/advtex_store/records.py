@@ -43,7 +43,7 @@ from advtex_contract.jobs import RETRYABLE, TERMINAL, WAITING, JobError, JobStat
 from advtex_contract.options import JobOptions, known_options, misunderstood
 from advtex_store import keys
 from advtex_store.accounts import check_active_jobs
-from advtex_store.counters import ATTEMPTS, count_one
+from advtex_store.counters import ATTEMPTS, BYTES, RESULT_UP, count_one
 from advtex_store.database import Database
 from advtex_store.errors import IllegalTransition, NotUnderstood, StaleAttempt
 from advtex_store.fair_queue import Gaze, WaitingJob, distinct_pairs, next_jobs, use_order_of_index
@@ -152,6 +152,7 @@ class Records(Transitions):
         lease_seconds: float | None = None,
         log_tail: str | None = None,
         waiting_reason: str | None = None,
+        moved: Mapping[str, int] | None = None,
     ) -> Lease:
         """Keep the lease and tell how far the attempt is. StaleAttempt: the lease is lost.
 
@@ -160,6 +161,7 @@ class Records(Transitions):
         10^7 plus step). Deaths count towards poison only while no attempt gets farther than the ones before.
         log_tail: the newest lines of the engine's log, shown if the job has to be given up.
         waiting_reason: why the attempt pauses, in words; empty when it does not.
+        moved: bytes since the last heartbeat (`counters.MOVES`); those of results are counted when it succeeds.
         """
         with self.database.write() as session:
             now = self.database.now(session)
@@ -177,6 +179,8 @@ class Records(Transitions):
                 row.progress, row.updated_at, row.version = data, now, row.version + 1
                 if stage_changed:
                     record_event(session, row, "progress", {name: data[name] for name in data if name != "notes"})
+            for move, size in sorted((moved or {}).items()):
+                count_one(session, BYTES, move, size)
             return Lease(row.lease_expires_at, row.cancel_requested)
 
     def succeed(
@@ -191,6 +195,7 @@ class Records(Transitions):
             sources = None if attempt is None else frozenset({S.running})
             data = [dict(result) for result in results]
             row = self.move(session, job_id, S.succeeded, fence=attempt, sources=sources, results=data)
+            count_one(session, BYTES, RESULT_UP, sum(result["size"] for result in data))
             self.finish(session, row, warnings=[*row.warnings, *(w.model_dump(mode="json") for w in warnings)])
 
     def fail(self, job_id: str, attempt: int, error: JobError, *, expired_only: bool = False) -> None:

@@ -22,7 +22,7 @@ HEAVY = {"torch", "numpy", "opencv-python-headless", "av", "imagecodecs", "usd-c
 
 def extras(dockerfile: str) -> str:
     """What it installs of the package: `server,traces`."""
-    return re.findall(r"'\.\[([\w,]+)\]'", dockerfile)[0]
+    return str(re.findall(r"'\.\[([\w,]+)\]'", dockerfile)[0])
 
 
 def closure(extras: str) -> dict[str, Distribution]:

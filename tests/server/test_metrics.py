@@ -65,6 +65,20 @@ def test_jobs_that_wait_are_told_by_the_class_that_they_need(make_live: Callable
     ], "where everybody reads them, they name no owner"
 
 
+def test_bytes_of_workers_are_told_by_direction_and_what(live: Any, scan_zip: Path) -> None:
+    def moved() -> dict[tuple[Any, ...], float]:
+        return {(key[2], key[4]): value for key, value in told(live).items() if key[0] == "advtex_worker_bytes_total"}
+
+    none = {("down", "checkpoint"): 0, ("down", "scan"): 0, ("up", "checkpoint"): 0, ("up", "result"): 0}
+    assert moved() == none
+    job = live.job(live.upload(scan_zip.read_bytes()))["id"]
+    live.store.records.claim(job, 1, "w")
+    for size in (100, 20):
+        live.store.records.heartbeat(job, 1, moved={"down scan": size, "up checkpoint": 7})
+    live.store.records.succeed(job, 1, [{"name": "a", "size": 5}, {"name": "b", "size": 6}])
+    assert moved() == {**none, ("down", "scan"): 120, ("up", "checkpoint"): 14, ("up", "result"): 11}
+
+
 @pytest.mark.one_machine("tests/store has the same on both databases")
 def test_owners_with_the_longest_lines_are_named_for_those_with_a_key(
     make_live: Callable[..., Any], is_error: Any, scan_zip: Path

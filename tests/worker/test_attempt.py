@@ -18,6 +18,7 @@ from structlog.testing import capture_logs
 
 from advtex_contract.jobs import JobState
 from advtex_store import keys
+from advtex_store.counters import BYTES, CHECKPOINT_DOWN, RESULT_UP, SCAN_DOWN
 from advtex_store.errors import BlobsRefused, BlobsUnavailable, NoSpace, ReferenceUnreadable
 from advtex_store.models import JobRow
 from advtex_store.queue import JobQueue
@@ -274,6 +275,21 @@ def test_an_outage_and_a_refusal_that_is_mended_cost_nothing(
     thread.join()
     row = store.records.job(job_id)
     assert (row.state, row.attempt, row.waiting_reason) == (JobState.succeeded, 1, "")
+
+
+def bytes_moved(store: Store) -> dict[str, int]:
+    return {row.label: int(row.total) for row in store.counters.counts() if row.name == BYTES}
+
+
+@pytest.mark.one_machine("rows count it, wherever blobs are")
+def test_bytes_that_an_attempt_moves_are_counted(store: Store, host: Hosts, new_job: NewJob) -> None:
+    job_id = new_job()
+    run_attempt(host("quick"), job_id, 1)
+    row = store.records.job(job_id)
+    moved = bytes_moved(store)
+    assert moved[SCAN_DOWN] == store.blobs.head(keys.scan_key(row.upload_id)).size
+    assert moved[RESULT_UP] == sum(result["size"] for result in row.results) > 0
+    assert CHECKPOINT_DOWN not in moved, "the first attempt has none"
 
 
 @pytest.mark.one_machine("the manifest is a blob like any other")

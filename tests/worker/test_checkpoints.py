@@ -65,6 +65,14 @@ def test_the_newest_version_of_every_file_comes_back(blobs: Blobs, tmp_path: Pat
     assert list((tmp_path / "snapshots").iterdir()) == [], "snapshots were left behind"
 
 
+def test_bytes_of_checkpoints_are_told(blobs: Blobs, tmp_path: Path) -> None:
+    sent = list[int]()
+    up = CheckpointUploader(blobs, JOB, 1, EMPTY, lambda: True, moved=sent.append)
+    up.add({"a": snapshot(tmp_path, "four"), "b": snapshot(tmp_path, "seven77")})
+    up.finish()
+    assert sorted(sent) == [4, 7]
+
+
 def test_what_is_no_longer_part_of_the_checkpoint_is_removed(blobs: Blobs, tmp_path: Path) -> None:
     base = EMPTY
     for attempt, text in ((1, "one"), (1, "two"), (1, "three")):

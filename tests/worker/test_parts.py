@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -227,6 +227,7 @@ class FakeRecords:
         reached: int,
         log_tail: str | None,
         waiting_reason: str,
+        moved: Mapping[str, int],
     ) -> Lease:
         self.heard.append((progress, reached, log_tail))
         self.stages += [told.stage for told in stages]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import socket
 import threading
+from collections.abc import Callable
 from typing import IO
 
 import structlog
@@ -33,9 +34,13 @@ class Stopping(Exception):
 
 class Ahead:
     """A thread that looks at what waits for workers of the class `gib`, of which this one is. It never takes anything,
-    and nothing depends on it."""
+    and nothing depends on it.
 
-    def __init__(self, store: Store, cache: ScanCache, gib: int) -> None:
+    moved: told of the bytes of each scan that it downloads.
+    """
+
+    def __init__(self, store: Store, cache: ScanCache, gib: int, moved: Callable[[int], None] = lambda _: None) -> None:
+        self._moved = moved
         self._store = store
         self._cache = cache
         self._gib = gib
@@ -78,6 +83,7 @@ class Ahead:
         def fill(file: IO[bytes]) -> None:
             for chunk in self._store.blobs.stream(key):
                 file.write(chunk)
+                self._moved(len(chunk))
                 self._check()
 
         with self._cache.held(cache_name(upload), fill, self._check):

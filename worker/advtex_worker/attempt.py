@@ -14,6 +14,7 @@ import structlog
 from advtex_contract.errors import ErrorDetail
 from advtex_contract.jobs import JobError
 from advtex_store import keys
+from advtex_store.counters import CHECKPOINT_DOWN, CHECKPOINT_UP, SCAN_DOWN
 from advtex_store.errors import BlobNotFound, ReferenceRefused, ResultsUnreadable, StaleAttempt
 from advtex_store.process_ends import how_it_ended
 from advtex_store.records import Claim
@@ -74,7 +75,6 @@ class Attempt:
         self._space = workspace_of(settings.workspaces, claim.job_id, claim.attempt)
         self._scan = self._space.scan
         self._cache = ScanCache(settings.scan_cache, settings.cached_bytes)
-        self._ahead = None if gib is None or self._cache.limit_bytes == 0 else Ahead(store, self._cache, gib)
         self._stack = ExitStack()  # of what is held for as long as the attempt lasts
         self._keeper = LeaseKeeper(
             store.records,
@@ -85,6 +85,8 @@ class Attempt:
             log_tail=self._log_tail,
             show=partial(store.live_progress.tell, claim.job_id, claim.attempt),
         )
+        fetched = partial(self._keeper.moved, SCAN_DOWN)
+        self._ahead = None if gib is None or self._cache.limit_bytes == 0 else Ahead(store, self._cache, gib, fetched)
         self._child: Child | None = None
         self._killers: list[threading.Timer] = []
         self._canceled_at = math.inf
@@ -117,9 +119,9 @@ class Attempt:
                 self._run()
         except Interrupted:
             self._give_back()
-        except ResultsUnreadable as error:
-            damage = error
-            self._patience.record(lambda: self._store.results.end_unread(self._job_id, self._number, damage))
+        except ResultsUnreadable as damage:
+            told = damage  # the name of an exception ends with its clause
+            self._patience.record(lambda: self._store.results.end_unread(self._job_id, self._number, told))
         except Refused as refused:
             error = JobError(code="storage_refused", message=str(refused), log_tail=self._log_tail())
             self._patience.record(lambda: self._store.records.fail(self._job_id, self._number, error))
@@ -136,12 +138,16 @@ class Attempt:
             self._ahead.start()
             self._stack.callback(self._ahead.stop)
         base = self._patience.transfer(lambda: restore(self._store.blobs, self._job_id, self._number, self._space.work))
+        self._keeper.moved(CHECKPOINT_DOWN, sum(file.size for file in base.files.values()))
         self._check_ending()
         self._warnings = base.warnings
         self._log.info("attempt begins", resumed_files=len(base.files))
         saved = partial(self._store.live_progress.saved, self._job_id, self._number)
         saved()
-        uploader = CheckpointUploader(self._store.blobs, self._job_id, self._number, base, self._keeper.held, saved)
+        sent = partial(self._keeper.moved, CHECKPOINT_UP)
+        uploader = CheckpointUploader(
+            self._store.blobs, self._job_id, self._number, base, self._keeper.held, saved, sent
+        )
         poster = LivePoster(self._store.live, self._job_id, self._number, self._keeper.held)
         ended: FinishedEvent | FailedEvent | StoppedEvent | None = None
         try:
@@ -163,6 +169,8 @@ class Attempt:
         if self._claim.source is not None:
             folder = self._space.root / "source"
             self._scan = self._store.references.fetch(self._claim.source, folder, self._check_ending)
+            copied = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())  # none of a file:// URL
+            self._keeper.moved(SCAN_DOWN, copied)
         elif self._cache.limit_bytes > 0:
             name = cache_name(self._claim.upload_id)
             self._scan = self._stack.enter_context(self._cache.held(name, self._download, self._check_ending))
@@ -173,6 +181,7 @@ class Attempt:
     def _download(self, file: IO[bytes]) -> None:
         for chunk in self._store.blobs.stream(self._claim.scan_key):
             file.write(chunk)
+            self._keeper.moved(SCAN_DOWN, len(chunk))
             self._check_ending()
 
     def _check_ending(self) -> None:

@@ -103,7 +103,7 @@ def _index_key(job_id: str, attempt: int) -> str:
 class CheckpointUploader:
     """Uploads snapshots on a thread of its own; what a newer snapshot replaces while it waits is skipped.
 
-    on_saved: called after each checkpoint that is complete.
+    on_saved: called after each checkpoint that is complete. moved: told of the bytes of each file that is uploaded.
     """
 
     def __init__(
@@ -114,7 +114,9 @@ class CheckpointUploader:
         base: CheckpointIndex,
         still_held: Callable[[], bool],
         on_saved: Callable[[], None] = lambda: None,
+        moved: Callable[[int], None] = lambda _: None,
     ) -> None:
+        self._moved = moved
         self._blobs = blobs
         self._on_saved = on_saved
         self._still_held = still_held
@@ -188,6 +190,7 @@ class CheckpointUploader:
         for number, (name, path) in enumerate(sorted(batch.items())):
             key = f"{prefix}{sequence}/{number}"
             written = self._blobs.upload(path, key)
+            self._moved(written.size)
             files[name] = CheckpointFile(key=key, size=written.size, sha256=written.sha256)
         if self._abandoned or not self._still_held():
             return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from enum import StrEnum
 
@@ -59,12 +60,14 @@ class LeaseKeeper:
         self._told_tail = ""
         self._progress: tuple[Progress | None, int] = (None, 0)
         self._stages: list[Progress] = []
+        self._moved = Counter[str]()
         self._shown: tuple[Progress | None, str] = (None, "")
         self._held_until = self._until()
         self._next_beat = _now() + self._rest()  # the claim has just been one
         self._done = threading.Event()
         self._beating = threading.Lock()
         self._deciding = threading.Lock()
+        self._counting = threading.Lock()
         self.ending: Ending | None = None
         self.paused = ""
         self._told: set[Ending] = set()
@@ -89,6 +92,11 @@ class LeaseKeeper:
         if before is None or before.stage != progress.stage:
             self._stages.append(progress)
         self._progress = (progress, reached)
+
+    def moved(self, move: str, size: int) -> None:
+        """Bytes went from or to the storage (`counters.MOVES`). From any thread; the next renewal tells of them."""
+        with self._counting:
+            self._moved[move] += size
 
     def end(self, ending: Ending) -> None:
         """The run has to end."""
@@ -124,6 +132,8 @@ class LeaseKeeper:
         progress, reached = self._progress
         stages = self._stages[:]
         tail = self._log_tail()
+        with self._counting:
+            moved = +self._moved  # without what is 0
         until = self._until()  # taken before it is asked for: the rows' lease ends later than this
         lease = self._records.heartbeat(
             self._job_id,
@@ -133,7 +143,10 @@ class LeaseKeeper:
             reached=reached,
             log_tail=tail if tail != self._told_tail else None,
             waiting_reason=self.paused,
+            moved=moved,
         )
+        with self._counting:
+            self._moved -= moved
         self._held_until, self._told_tail = until, tail
         self._next_beat = _now() + self._rest()
         del self._stages[: len(stages)]

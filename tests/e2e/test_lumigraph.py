@@ -13,7 +13,7 @@ import torch
 from atlases import camera
 from browsing import FLAGS, chromium
 from lumigraph import blended, photographed_scene, photographs
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Browser, Page, sync_playwright
 
 from advtex_engine.core.cameras import camera_to_world
 from advtex_engine.core.scene import TO_Y_UP, Camera
@@ -44,19 +44,24 @@ DRAW = """async ({ views, place }) => {
 }"""
 
 
-@pytest.fixture
-def page(tmp_path: Path) -> Iterator[Page]:
-    """A page with the server's scripts and the files of `tmp_path`, without a server."""
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium(), args=FLAGS)
-        tab = browser.new_page()
+        opened = playwright.chromium.launch(executable_path=chromium(), args=FLAGS)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def page(browser: Browser, tmp_path: Path) -> Iterator[Page]:
+    """A page with the viewer's scripts and the files of `tmp_path`, without a server."""
+    with browser.new_page() as tab:
         tab.route("http://page/", lambda route: route.fulfill(body="", content_type="text/html"))
         tab.route("http://page/*.js", lambda route: route.fulfill(path=FOLDER / route.request.url.rpartition("/")[2]))
         tab.route("http://page/model.glb", lambda route: route.fulfill(path=tmp_path / "model.glb"))
         tab.route("http://page/stream", lambda route: route.fulfill(path=tmp_path / "stream"))
         tab.goto("http://page/")
         yield tab
-        browser.close()
 
 
 @pytest.mark.parametrize("eye", [(2.6, 1.0, 1.8), (1.9, -2.2, 0.9)], ids=["on the path", "beside it"])

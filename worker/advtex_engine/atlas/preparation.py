@@ -42,10 +42,9 @@ class MeshPreparation:
     ) -> None:
         self._face_budget, self._charts, self._box, self._holes = face_budget, charts, box, holes
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="advtex-mesh")
-        self._said = _Said()
         self._up_axis = "+z"
-        self._cleaned: Future[Mesh] | None = None
-        self._prepared: Future[tuple[Mesh, Trimmed]] | None = None
+        self._reduced: Future[tuple[Mesh, list[Problem]]] | None = None  # of a mesh that moves
+        self._prepared: Future[tuple[Mesh, Trimmed, list[Problem]]] | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -54,32 +53,37 @@ class MeshPreparation:
         self._pool.shutdown()
 
     def begin(self, mesh: Mesh, *, up_axis: str = "+z", moves: bool = False) -> None:
-        """Begins with a mesh. moves: `result` will move it before it is trimmed, as the box is one of that world."""
-        self._said, self._up_axis = _Said(), up_axis
-        self._cleaned = self._pool.submit(self._clean, mesh) if moves else None
-        self._prepared = None if moves else self._pool.submit(lambda: self._trim(clean(mesh), True))
+        """Begins with a mesh. moves: `result` will move it, so that charts of it would be of no use, and then trims it:
+        the box is one of the world that it is moved to."""
+        self._up_axis = up_axis
+        self._reduced = self._pool.submit(self._reduce, mesh) if moves else None
+        self._prepared = None if moves else self._pool.submit(self._prepare, mesh, up_axis, False)
 
     def result(self, monitor: Monitor, move: Callable[[Mesh], Mesh] | None = None) -> tuple[Mesh, dict[str, Any]]:
         """The mesh that was begun with, once it is ready, and what was trimmed of it, for the report.
 
-        move: of a mesh that moves, before it is trimmed. Raises what it, `clean` and `crop` do, and tells the monitor
-        the rest.
+        move: of a mesh that moves. Raises what it, `clean` and `crop` do, and tells the monitor the rest.
         """
         if self._prepared is None:
-            assert self._cleaned is not None
-            cleaned = self._cleaned.result()
-            self._prepared = self._pool.submit(self._trim, cleaned if move is None else move(cleaned), False)
-        mesh, trimmed = self._prepared.result()
-        for problem in self._said.problems:
+            assert self._reduced is not None
+            reduced, said = self._reduced.result()
+            for problem in said:
+                monitor.warning(problem)
+            moved = reduced if move is None else move(reduced)
+            self._prepared = self._pool.submit(self._prepare, moved, self._up_axis, True)
+        mesh, trimmed, problems = self._prepared.result()
+        for problem in problems:
             monitor.warning(problem)
         return mesh, asdict(trimmed)
 
-    def _clean(self, mesh: Mesh) -> Mesh:
-        return decimate(clean(mesh), self._face_budget, self._said)
+    def _reduce(self, mesh: Mesh) -> tuple[Mesh, list[Problem]]:
+        said = _Said()
+        return decimate(clean(mesh), self._face_budget, said), said.problems
 
-    def _trim(self, cleaned: Mesh, stays: bool) -> tuple[Mesh, Trimmed]:
-        said = self._said
-        cropped = cleaned if self._box is None else crop(cleaned, self._box, self._up_axis)
+    def _prepare(self, mesh: Mesh, up_axis: str, moves: bool) -> tuple[Mesh, Trimmed, list[Problem]]:
+        said = _Said()
+        cleaned = clean(mesh)
+        cropped = cleaned if self._box is None else crop(cleaned, self._box, up_axis)
         kept, floaters = drop_floaters(cropped)
         lost = len(cropped.t_pos_idx) - len(kept.t_pos_idx)
         if floaters:
@@ -88,13 +92,13 @@ class MeshPreparation:
         closed, holes = (prepared, 0) if self._holes is None else close_holes(prepared, self._holes)
         if holes and prepared.v_uv is not None:
             said.warning(_uv_dropped(holes))
-        if stays:
+        if not moves:
             begin_charts(closed, self._charts)
         outside, added = (
             len(cleaned.t_pos_idx) - len(cropped.t_pos_idx),
             len(closed.t_pos_idx) - len(prepared.t_pos_idx),
         )
-        return closed, Trimmed(outside, floaters, lost, holes, added)
+        return closed, Trimmed(outside, floaters, lost, holes, added), said.problems
 
 
 def _floaters_dropped(floaters: int, faces: int) -> Problem:

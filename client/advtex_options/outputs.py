@@ -36,7 +36,7 @@ OUTPUTS: Mapping[str, Output] = MappingProxyType(
             ("model.3tz",), "for viewers of 3D Tiles: a zip of a tileset of GLB tiles under 3 MB each", "large"
         ),
         "draco": Output(
-            ("model_draco.glb",), "for viewers with a decoder of Draco: a fourth of the bytes of the faces", "asked"
+            ("model_draco.glb",), "for viewers with a decoder of Draco: an eighth of the bytes of the faces", "asked"
         ),
         "webp": Output(("model_webp.glb",), "for viewers that take WebP: fewer bytes of the images", "asked"),
     }

@@ -124,16 +124,18 @@ def ended(store: Store) -> int:
 def run_nights(night: Night, roots: Sequence[Path], scenes: Sequence[int], workers: int) -> Comings:
     """Submit and carry out both, and disturb the first."""
     running = night.fleet
-    with ThreadPoolExecutor(1) as pool:
+    with ThreadPoolExecutor(1) as pool, ExitStack() as stack:
         night.submission = pool.submit(night.client, "batch", "submit", str(roots[0]), "--id", "night", *FIRST)
         wait_until(lambda: running.store.records.count_by_state() or night.submission.done(), seconds=300)
         comings = Comings(running, workers, night.folder, SPAN)
+        stack.callback(comings.abandon)
         disturb(night, comings, scenes[0])
-    _wait(night, scenes[0], comings)
-    night.tell("the first night has ended")
-    night.client("batch", "submit", str(roots[1]), "--id", "night2", *SECOND)
-    _wait(night, sum(scenes), comings)
-    night.tell("the second night has ended")
+        _wait(night, scenes[0], comings)
+        night.tell("the first night has ended")
+        night.client("batch", "submit", str(roots[1]), "--id", "night2", *SECOND)
+        _wait(night, sum(scenes), comings)
+        night.tell("the second night has ended")
+        comings.stop()
     return comings
 
 
@@ -337,7 +339,6 @@ def main() -> int:
         running.store.webhooks.create("night", f"{traces.url}/hook", sorted(TERMINAL))
         night = Night(running, folder, key)
         comings = run_nights(night, roots, scenes, told.workers)
-        comings.stop()
         wrong = finish(night, comings, traces, told.out, told.report or folder)
     print((told.out / "night.md").read_text())
     return 1 if wrong else 0

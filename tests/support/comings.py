@@ -51,13 +51,17 @@ class Comings:
         self.runners_killed = 0
         self.failures: list[str] = []
         fleet.workers = [fleet.start_worker(number, arguments=(IDLE, str(IDLE_SECONDS))) for number in range(workers)]
-        self._threads = [threading.Thread(target=self._keep, args=(number,)) for number in range(workers)]
+        self._threads = [threading.Thread(target=self._keep, args=(n,), daemon=True) for n in range(workers)]
         for thread in self._threads:
             thread.start()
 
-    def stop(self) -> None:
-        """No more are started; those that are there go once they have been idle for long enough."""
+    def abandon(self) -> None:
+        """No more are started."""
         self._done.set()
+
+    def stop(self) -> None:
+        """The same; and wait until those that are there have gone, having been idle for long enough."""
+        self.abandon()
         for thread in self._threads:
             thread.join()
 

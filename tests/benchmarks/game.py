@@ -24,6 +24,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from harness import (
     RESULTS,
@@ -229,23 +230,26 @@ def report(arguments: argparse.Namespace, results: Results) -> None:
 
 
 def draw_curves(path: Path, runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
-    """A PNG with a row of PANELS per run."""
-    figure = Figure(figsize=(3.2 * len(PANELS), 2.6 * len(runs)), layout="tight")
-    for row, (title, cells) in zip(figure.subplots(len(runs), len(PANELS), squeeze=False), runs.items(), strict=True):
-        row[0].set_ylabel(title.replace(", ", "\n", 1), fontsize=7)
-        row[0].set_ylim(0, 1)
-        row[0].axhspan(*CHANCE, color="0.9")
-        for place, (name, scores) in zip(row, PANELS.items(), strict=True):
+    """A PNG with the PANELS of each run, in two rows."""
+    columns = len(PANELS) // 2
+    figure = Figure(figsize=(4 * columns, 5 * len(runs)), layout="constrained")
+    for part, (title, cells) in zip(np.ravel(figure.subfigures(len(runs), 1)), runs.items(), strict=True):
+        part.suptitle(title, fontsize=9)
+        places = np.ravel(part.subplots(2, columns))
+        for place, (name, scores) in zip(places, PANELS.items(), strict=True):
             for score in scores:
                 known = [cell for cell in cells if score in cell["scores"]]
                 steps = [cell["settings"]["step"] for cell in known]
                 values = [cell["scores"][score] for cell in known]
                 place.plot(steps, values, marker="o", markersize=2, linewidth=1, label=TABLE[score])
             place.set_title(name, fontsize=8)
-            place.set_xlabel("step", fontsize=7)
-            place.tick_params(labelsize=6)
+            place.tick_params(labelsize=7)
             place.legend(fontsize=6)
-    figure.savefig(path, dpi=110)
+        places[0].set_ylim(0, 1)
+        places[0].axhspan(*CHANCE, color="0.9")
+        places[1].set_yscale("symlog", linthresh=0.01)
+        places[2].set_yscale("symlog", linthresh=0.001)
+    figure.savefig(path, dpi=100)
 
 
 def main(line: list[str] | None = None) -> None:

@@ -76,7 +76,7 @@ def stretches(points: Sequence[Point], pretraining: int, steps: int) -> list[Str
 
     What the discriminator does not know before is no fault. Stretches in which nothing was judged are left out.
     """
-    after = steps - pretraining
+    after = max(1, steps - pretraining)
     size = after / max(1, round(after / (SHARE * steps)))
     found = dict[int, list[tuple[int, Point]]]()
     before = 0

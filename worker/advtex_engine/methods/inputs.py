@@ -27,8 +27,9 @@ class MethodInput:
     live: shows the texture while it is optimized.
     start: dense texture [H,W,3] that the adversarial methods start from; None: preset.start needs no more than `means`.
     on_device: views of full size that may be on the device at a time, while pairs are drawn; None: all are.
-    facts: what the method says about how it ran, by name: "step" for the report, whose "refinement" takes what is under
-    that name; "known" is [H,W] bool, where the texture shows a photograph; all that views touch, if it does not say.
+    facts: what the method says about how it ran, by name: "step" and "game" for the report, whose "refinement" takes
+    what is under that name; "known" is [H,W] bool, where the texture shows a photograph; all that views touch, if it
+    does not say.
     """
 
     scene: Scene

@@ -38,11 +38,11 @@ from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Scene
 from advtex_engine.ingest.read import ingest
 from advtex_engine.mesh.models import load_model
-from advtex_engine.metrics.evaluate import VIEW_METRICS, Comparison, compare, mean_scores, score
+from advtex_engine.metrics.evaluate import VIEW_METRICS, compare, mean_scores, score
 from advtex_engine.metrics.lpips import Lpips
 from advtex_engine.pipeline import texture_scan
 from advtex_engine.render.pictures import encode_jpeg, to_bytes
-from advtex_engine.render.render_view import render_view
+from advtex_engine.render.render_view import render_layers, render_view
 from advtex_engine.results.baking import TexturedModel
 from advtex_engine.results.export import export_model
 from advtex_engine.runtime.files import write_atomically
@@ -187,7 +187,7 @@ class Judge:
 
 def table(run: Run, scene: Scene, lpips: Lpips, judge: Judge | None, sheet: Path) -> list[list[object]]:
     """A line per file, and their picture from the middle one of the held-out places."""
-    rows, panels, exact = list[list[object]](), dict[str, Tensor](), list[Comparison | None]()
+    rows, panels, exact = list[list[object]](), dict[str, Tensor](), list[tuple[Tensor, Tensor]]()
     shown = scene.heldout[len(scene.heldout) // 2]
     panels["photograph"] = shown.color.float() / 255
     for paths in run.files:
@@ -201,15 +201,15 @@ def table(run: Run, scene: Scene, lpips: Lpips, judge: Judge | None, sheet: Path
             rows.append([f"`{name}` ({reason})", size, *["-"] * 5, judged, seconds])
             continue
         compared = [compare(atlas, texture, view, scene.mesh) for view in scene.heldout]
-        exact = exact or compared
         scores = mean_scores([score(one, lpips, VIEW_METRICS) for one in compared if one is not None])
-        pairs = [
-            (one, other) for one, other in zip(compared, exact, strict=True) if one is not None and other is not None
-        ]
-        apart = sum(lpips.masked(one.image, other.image, other.mask) for one, other in pairs) / len(pairs)
+        layers = [render_layers(atlas, texture, view.camera) for view in scene.heldout]
+        exact = exact or layers
+        pairs = [(one, other, there == 1) for (one, _), (other, there) in zip(layers, exact, strict=True)]
+        apart = [lpips.masked(*pair) for pair in pairs if bool(pair[2].any())]
         model = TexturedModel(atlas, texture)
         sides = f"{atlas.width}" if atlas.width == atlas.height else f"{atlas.width} x {atlas.height}"
-        rows.append([f"`{name}`", size, model.faces, sides, scores["lpips"], scores["psnr"], apart, judged, seconds])
+        looks: list[object] = [scores["lpips"], scores["psnr"], sum(apart) / len(apart)]
+        rows.append([f"`{name}`", size, model.faces, sides, *looks, judged, seconds])
         panels[name] = render_view(atlas, texture, shown.camera)
         print(*rows[-1], flush=True)
     write_atomically(sheet, encode_jpeg(_panels(panels), QUALITY))

@@ -272,8 +272,8 @@ def main(line: list[str] | None = None) -> None:
             day = datetime.datetime.now(datetime.UTC).date().isoformat()
             told = {"scan": name, "rows": [dict(zip(HEAD, row, strict=True)) for row in rows]}
             cells.append({**told, "date": day, "command": command(), "seconds": watch.seconds})
-    write_atomically(arguments.results / "models.json", json.dumps({"cells": cells}, indent=1).encode() + b"\n")
-    write_report(arguments.results / "models.md", "Files of a result", cells, body)
+            write_atomically(arguments.results / "models.json", json.dumps({"cells": cells}, indent=1).encode() + b"\n")
+            write_report(arguments.results / "models.md", "Files of a result", cells, body)
 
 
 if __name__ == "__main__":

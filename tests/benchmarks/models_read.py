@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import io
+import json
 import math
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
@@ -32,7 +33,7 @@ def read_model(path: Path, up_axis: str) -> tuple[Atlas, Tensor]:
 
     up_axis: of the scan; all files but the OBJ are +Y up. Several images are laid out in a grid.
     """
-    readers = {".obj": _with_trimesh, ".glb": _with_trimesh, ".usdz": _with_usd}
+    readers = {".obj": _with_trimesh, ".glb": _with_trimesh, ".usdz": _with_usd, ".3tz": _leaves}
     if path.suffix not in readers:
         raise Unread(f"no reader of {path.suffix} files")
     parts = readers[path.suffix](path)
@@ -43,9 +44,24 @@ def read_model(path: Path, up_axis: str) -> tuple[Atlas, Tensor]:
     return _joined(parts)
 
 
-def _with_trimesh(path: Path) -> list[Part]:
+def _leaves(path: Path) -> list[Part]:
+    """The finest tiles of a tileset of GLB tiles without transforms, as they lie in the GLBs."""
+    with zipfile.ZipFile(path) as archive:
+        waiting, parts = [json.loads(archive.read("tileset.json"))["root"]], list[Part]()
+        while waiting:
+            tile = waiting.pop()
+            waiting += tile.get("children", [])
+            if "transform" in tile:
+                raise Unread("its tiles are moved")
+            if "children" not in tile:
+                parts += _with_trimesh(io.BytesIO(archive.read(tile["content"]["uri"])))
+    return parts
+
+
+def _with_trimesh(file: Path | BinaryIO) -> list[Part]:
     try:
-        scene = trimesh.load_scene(path, process=False)
+        kind = None if isinstance(file, Path) else "glb"
+        scene = trimesh.load_scene(file, file_type=kind, process=False)
     except Exception as error:  # whatever the readers of formats and images raise
         raise Unread(f"trimesh: {error}") from error
     parts = []

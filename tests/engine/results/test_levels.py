@@ -47,6 +47,22 @@ def test_levels_have_a_quarter_of_the_faces_and_texels_each_and_look_the_same(tm
         faces, texels = level.faces, level.texels
 
 
+@pytest.mark.parametrize(("share", "most"), [(1 / 1.5, 0.008), (1 / 4, 0.02)])
+def test_fewer_texels_are_as_sharp_as_they_can_be(share: float, most: float) -> None:
+    """Waves of eleven texels, drawn at two pixels to one of theirs: bilinear samples are off by .012 and .048."""
+    sheet = many_charts(4, 512)
+    rows, columns = np.mgrid[:512, :512]
+    waves = np.sin(columns * 2 * np.pi / 11) * np.sin(rows * 2 * np.pi / 11)
+    texture = np.repeat(np.rint(127 + 100 * waves)[..., None], 3, 2).astype(np.uint8)
+    source = TexturedModel(sheet.atlas, torch.from_numpy(texture))
+    bare = Mesh(source.atlas.mesh.v_pos, source.atlas.mesh.t_pos_idx)
+    K = torch.tensor([[1300.0, 0, 64], [0, 1300, 64], [0, 0, 1]], dtype=torch.float64)
+    close = Camera(K, FROM_ABOVE.world_to_camera, 128, 128)
+    before = render_view(source.atlas, source.texture, close)
+    baked = bake(source, bare, share, 4096, Monitor()).model
+    assert float((render_view(baked.atlas, baked.texture, close) - before).abs().mean()) < most
+
+
 def test_the_model_for_phones_has_few_faces_and_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     full = many_charts()
     monkeypatch.setattr(levels, "MOBILE_FACES", 1500)

@@ -12,6 +12,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from advtex_engine.atlas.build import SIZE_STEP, new_atlas
@@ -22,11 +23,19 @@ from advtex_engine.mesh.clean import decimate
 from advtex_engine.mesh.closest import ClosestPoints
 from advtex_engine.render.pictures import to_bytes
 from advtex_engine.render.texels import map_texels, surface_points
-from advtex_engine.render.texture import fill_holes, sample_image
+from advtex_engine.render.texture import fill_holes
 
 SOFTENED = 1.4
 """Texels of the source along a texel's side: from here on the source is averaged before it is sampled, else it would
 flicker. The kernel stays within the padding of the charts, so that they do not run into each other."""
+KERNEL = np.array([0.25, 0.5, 0.25])
+SHARPENED = 3
+"""Rounds by which an averaged image is sharpened against the viewer's bilinear filter. With it and bicubic samples the
+first level of detail of a kitchen is .032 LPIPS from the full model, without either .075. An image that is not averaged
+becomes worse by it."""
+BILINEAR = np.array([0.125, 0.75, 0.125])
+"""What is left of a texel where an image is drawn at twice its size, bilinearly, and averaged again."""
+ROW = 1 << 14  # samples in a row: OpenCV takes no more than 32,767
 
 
 @dataclass(frozen=True)
@@ -104,22 +113,35 @@ def bake(source: TexturedModel, mesh: Mesh, share: float, side: int, monitor: Mo
     fine = replace(atlas, width=atlas.width * finer, height=atlas.height * finer)
     texels = map_texels(fine)
     points = source.closest.find(surface_points(mesh, texels), normal[texels.face])
-    color = _sampled(source, points.mix(*_uv(source.atlas.mesh)), soft=ratio / finer >= SOFTENED)
+    averaged = ratio / finer >= SOFTENED
+    color = _sampled(source, points.mix(*_uv(source.atlas.mesh)), soft=averaged)
     texture = torch.zeros((fine.height * fine.width, 3))
     known = torch.zeros(len(texture), dtype=torch.bool)
     texture[texels.texel], known[texels.texel] = color, True
-    filled = fill_holes(texture.view(fine.height, fine.width, 3), known.view(fine.height, fine.width))
-    image = cv2.resize(to_bytes(filled / 255), (atlas.width, atlas.height), interpolation=cv2.INTER_AREA)
+    filled = fill_holes(texture.view(fine.height, fine.width, 3), known.view(fine.height, fine.width)).numpy()
+    image = cv2.resize(filled, (atlas.width, atlas.height), interpolation=cv2.INTER_AREA)
+    image = to_bytes(torch.from_numpy(_sharpened(image) if averaged or finer > 1 else image) / 255)
     apart = points.distance[texels.barycentric.amin(1) >= 0].numpy()  # other texels lie beside their face
     return Baked(TexturedModel(atlas, torch.from_numpy(image)), float(np.quantile(apart, 0.999)))
 
 
 def _sampled(source: TexturedModel, uv: Tensor, *, soft: bool) -> Tensor:
-    """[N,3] float32 in [0,255]."""
+    """[N,3] float32 in [0,255], by bicubic interpolation: bilinear samples of an image of bilinear samples are dull."""
     image = source.texture.numpy()
     if soft:
-        image = cv2.sepFilter2D(image, -1, np.array([0.25, 0.5, 0.25]), np.array([0.25, 0.5, 0.25]))
-    return sample_image(torch.from_numpy(image), uv * uv.new_tensor([source.atlas.width, source.atlas.height]))
+        image = cv2.sepFilter2D(image, -1, KERNEL, KERNEL)
+    place = uv * uv.new_tensor([source.atlas.width, source.atlas.height]) - 0.5
+    rows = np.pad(place.numpy(), ((0, -len(place) % ROW), (0, 0))).reshape(-1, ROW, 2)
+    color = cv2.remap(image, rows, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return torch.from_numpy(color.reshape(-1, 3)[: len(place)].astype(np.float32))
+
+
+def _sharpened(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[H,W,3] whose bilinear interpolation has the image as its averages, nearly (Van Cittert 1931)."""
+    sharp = image
+    for _ in range(SHARPENED):
+        sharp = sharp + image - cv2.sepFilter2D(sharp, -1, BILINEAR, BILINEAR)
+    return sharp
 
 
 def _uv(mesh: Mesh) -> tuple[Tensor, Tensor]:

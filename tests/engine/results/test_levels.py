@@ -15,7 +15,7 @@ from sheets import FROM_ABOVE, many_charts
 
 from advtex_engine.core.errors import Problem
 from advtex_engine.core.monitor import Monitor
-from advtex_engine.core.scene import Atlas, Mesh
+from advtex_engine.core.scene import Atlas, Camera, Mesh
 from advtex_engine.mesh.models import load_model
 from advtex_engine.render.render_view import render_view
 from advtex_engine.results import levels

@@ -63,7 +63,9 @@ export class CropBox {
     viewer.dispatchEvent(new CustomEvent("camera-change", { detail: { source: "user-interaction" } })); // a photograph at its camera goes
     viewer.cameraTarget = rotated(stand, whole.center).map((metres) => `${metres}m`).join(" ");
     viewer.fieldOfView = `${ACROSS}deg`;
-    viewer.cameraOrbit = `${viewer.getCameraOrbit().theta}rad ${ABOVE}deg ${reach / Math.sin(across / 2)}m`;
+    const distance = reach / Math.sin(across / 2);
+    viewer.maxCameraOrbit = `auto 180deg ${2 * distance}m`; // by itself it stays nearer to the model
+    viewer.cameraOrbit = `${viewer.getCameraOrbit().theta}rad ${ABOVE}deg ${distance}m`;
     viewer.updateComplete.then(() => { viewer.jumpCameraToGoal(); this.draw(); });
   }
 

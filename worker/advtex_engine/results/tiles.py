@@ -62,7 +62,7 @@ def write_tiles(
 
 
 class _Tiler:
-    """levels: the finest first."""
+    """Cuts the levels, the finest first, into tiles. add: of the archive. scratch: a file to write to."""
 
     def __init__(self, up_axis: str, most: int, add: Callable[[str, bytes], None], scratch: Path) -> None:
         self.levels = list[Level]()
@@ -100,15 +100,16 @@ class _Tiler:
         if len(faces) == 0:
             return self._below(number, cell)
         data = self._encoded(level, faces)
-        if len(data) > self.most:
-            if halves := cell.halves(self.levels):
-                return [tile for half in halves for tile in self._tiles(number, half)]
-            data = next((data for q in QUALITIES if len(data := self._encoded(level, faces, q)) <= self.most), data)
+        if len(data) > self.most and (halves := cell.halves(self.levels)):
+            return [tile for half in halves for tile in self._tiles(number, half)]
+        for quality in QUALITIES:
+            if len(data) > self.most:
+                data = self._encoded(level, faces, quality)
         name = f"{len(self.levels) - 1 - number}/{self.written}.glb"
         self.written += 1
         self.add(name, data)
         below = self._below(number, cell)
-        points = level.mesh.v_pos[level.mesh.t_pos_idx[faces].unique()].double().numpy() @ self.to_tileset.T
+        points = level.mesh.v_pos[level.mesh.t_pos_idx[faces]].double().view(-1, 3).numpy() @ self.to_tileset.T
         errors = [level.error_of(faces) if number else 0.0, *(tile["geometricError"] for tile in below)]
         volume = _box(np.concatenate([points, *map(corners_of, below)]))
         tile = {**volume, "geometricError": max(errors), "content": {"uri": name}}
@@ -116,12 +117,10 @@ class _Tiler:
 
     def _below(self, number: int, cell: Cell) -> list[Tile]:
         """The tiles of the next finer level, whose cells are quarters of those that are not cut further."""
+        if number == 0:
+            return []
         depth = 2 * (len(self.levels) - number)
-        return (
-            [tile for part in cell.parts(depth, self.levels) for tile in self._tiles(number - 1, part)]
-            if number
-            else []
-        )
+        return [tile for part in cell.parts(depth, self.levels) for tile in self._tiles(number - 1, part)]
 
     def _encoded(self, level: Level, faces: Tensor, quality: int = JPEG_QUALITY) -> bytes:
         write_pages(self.scratch, [cut_out(level.model, faces)], level.normals, self.up_axis, quality)

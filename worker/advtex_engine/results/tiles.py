@@ -21,6 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from advtex_engine.core.errors import Stopped
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import TO_Y_UP, Atlas
 from advtex_engine.results.archive import tileset_archive
@@ -45,17 +46,24 @@ Tile = dict[str, Any]
 
 
 def write_tiles(
-    out: Path, atlas: Atlas, texture: Tensor, *, up_axis: str, name: str = "model", most: int = TILE_BYTES
+    out: Path,
+    atlas: Atlas,
+    texture: Tensor,
+    *,
+    up_axis: str,
+    name: str = "model",
+    most: int = TILE_BYTES,
+    monitor: Monitor | None = None,
 ) -> Path:
     """Write `name`.3tz, an archive of tileset.json and the tiles; -> its path. texture: as `export_model` takes it.
 
     most: bytes of a tile's file. A tile's geometric error is in metres: how far its surface and the full model's are
     apart, at corners and centers of the faces of both, or the side of its texels where that is more; it is 0 for tiles
-    of the full model, and never less than that of a tile below.
+    of the full model, and never less than that of a tile below. Raises Stopped when the monitor asks for it.
     """
     path = out / f"{name}.3tz"
     with tempfile.TemporaryDirectory(prefix="advtex-tiles-") as folder, tileset_archive(path) as add:
-        tiler = _Tiler(up_axis, most, add, Path(folder, "tile.glb"))
+        tiler = _Tiler(up_axis, most, add, Path(folder, "tile.glb"), monitor or Monitor())
         tiler.make_levels(TexturedModel.of(atlas, texture))
         add("tileset.json", json_text(tiler.tileset()).encode())
     return path
@@ -64,8 +72,11 @@ def write_tiles(
 class _Tiler:
     """Cuts the levels, the finest first, into tiles. add: of the archive. scratch: a file to write to."""
 
-    def __init__(self, up_axis: str, most: int, add: Callable[[str, bytes], None], scratch: Path) -> None:
+    def __init__(
+        self, up_axis: str, most: int, add: Callable[[str, bytes], None], scratch: Path, monitor: Monitor
+    ) -> None:
         self.levels = list[Level]()
+        self.monitor = monitor
         self.up_axis, self.most, self.add, self.scratch = up_axis, most, add, scratch
         self.to_tileset = tileset_axes(up_axis)
         self.written = 0
@@ -123,6 +134,8 @@ class _Tiler:
         return [tile for part in cell.parts(depth, self.levels) for tile in self._tiles(number - 1, part)]
 
     def _encoded(self, level: Level, faces: Tensor, quality: int = JPEG_QUALITY) -> bytes:
+        if self.monitor.stop_requested():
+            raise Stopped("stopped while tiles were made; resume makes all of them again")
         write_pages(self.scratch, [cut_out(level.model, faces)], level.normals, self.up_axis, quality)
         return self.scratch.read_bytes()
 

@@ -115,7 +115,7 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
         files += write_smaller(out, atlas, texture, outputs, up_axis=scene.up_axis, monitor=stages.monitor)
         files += write_compressed(out, atlas, texture, outputs, lossless=bool(config.lossless))
         if "tiles" in outputs:
-            files += (write_tiles(out, atlas, texture, up_axis=scene.up_axis),)
+            files += (write_tiles(out, atlas, texture, up_axis=scene.up_axis, monitor=stages.monitor),)
     with stages.run("previews"):
         told = curves(losses, given.live.quality, game["curve"] if game else ())
         files += write_gallery(out, scene, atlas, texture, mean, told, completed.state)

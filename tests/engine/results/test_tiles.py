@@ -16,6 +16,8 @@ import pytest
 import torch
 from sheets import FROM_ABOVE, many_charts
 
+from advtex_engine.core.errors import Stopped
+from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import TO_Y_UP, Atlas, Mesh
 from advtex_engine.mesh.clean import clean
 from advtex_engine.mesh.models import load_model
@@ -205,6 +207,17 @@ def test_a_part_that_is_cut_out_looks_like_the_model() -> None:
     whole, part = (render_view(*one, FROM_ABOVE) for one in ((FULL.atlas, FULL.texture), (atlas, page.image)))
     left = slice(20, 62)
     assert float((whole - part)[:, left].abs().max()) < 1e-4
+
+
+class Stopping(Monitor):
+    def stop_requested(self) -> bool:
+        return True
+
+
+def test_a_stop_leaves_no_half_of_a_tileset(tmp_path: Path) -> None:
+    with pytest.raises(Stopped, match="resume makes all of them again"):
+        write_tiles(tmp_path, FULL.atlas, FULL.texture, up_axis="+z", monitor=Stopping())
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_boxes_do_not_overlap() -> None:

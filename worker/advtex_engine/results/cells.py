@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -50,7 +51,7 @@ class Level:
     def error_of(self, faces: Tensor) -> float:
         """Metres, of these faces [N]: their distance from the full model, or the side of their texels, the larger."""
         texel = float(self.areas[faces].sum()) / max(self.model.texels_of(faces), 1)
-        return max(float(self.error[faces].max()), texel**0.5)
+        return max(float(self.error[faces].max()), math.sqrt(texel))
 
 
 @dataclass(frozen=True)

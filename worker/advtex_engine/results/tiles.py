@@ -21,6 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from advtex_engine.core.errors import Stopped
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import TO_Y_UP, Atlas
 from advtex_engine.results.archive import tileset_archive
@@ -45,27 +46,37 @@ Tile = dict[str, Any]
 
 
 def write_tiles(
-    out: Path, atlas: Atlas, texture: Tensor, *, up_axis: str, name: str = "model", most: int = TILE_BYTES
+    out: Path,
+    atlas: Atlas,
+    texture: Tensor,
+    *,
+    up_axis: str,
+    name: str = "model",
+    most: int = TILE_BYTES,
+    monitor: Monitor | None = None,
 ) -> Path:
     """Write `name`.3tz, an archive of tileset.json and the tiles; -> its path. texture: as `export_model` takes it.
 
     most: bytes of a tile's file. A tile's geometric error is in metres: how far its surface and the full model's are
     apart, at corners and centers of the faces of both, or the side of its texels where that is more; it is 0 for tiles
-    of the full model, and never less than that of a tile below.
+    of the full model, and never less than that of a tile below. Raises Stopped when the monitor asks for it.
     """
     path = out / f"{name}.3tz"
     with tempfile.TemporaryDirectory(prefix="advtex-tiles-") as folder, tileset_archive(path) as add:
-        tiler = _Tiler(up_axis, most, add, Path(folder, "tile.glb"))
+        tiler = _Tiler(up_axis, most, add, Path(folder, "tile.glb"), monitor or Monitor())
         tiler.make_levels(TexturedModel.of(atlas, texture))
         add("tileset.json", json_text(tiler.tileset()).encode())
     return path
 
 
 class _Tiler:
-    """levels: the finest first."""
+    """Cuts the levels, the finest first, into tiles. add: of the archive. scratch: a file to write to."""
 
-    def __init__(self, up_axis: str, most: int, add: Callable[[str, bytes], None], scratch: Path) -> None:
+    def __init__(
+        self, up_axis: str, most: int, add: Callable[[str, bytes], None], scratch: Path, monitor: Monitor
+    ) -> None:
         self.levels = list[Level]()
+        self.monitor = monitor
         self.up_axis, self.most, self.add, self.scratch = up_axis, most, add, scratch
         self.to_tileset = tileset_axes(up_axis)
         self.written = 0
@@ -100,15 +111,16 @@ class _Tiler:
         if len(faces) == 0:
             return self._below(number, cell)
         data = self._encoded(level, faces)
-        if len(data) > self.most:
-            if halves := cell.halves(self.levels):
-                return [tile for half in halves for tile in self._tiles(number, half)]
-            data = next((data for q in QUALITIES if len(data := self._encoded(level, faces, q)) <= self.most), data)
+        if len(data) > self.most and (halves := cell.halves(self.levels)):
+            return [tile for half in halves for tile in self._tiles(number, half)]
+        for quality in QUALITIES:
+            if len(data) > self.most:
+                data = self._encoded(level, faces, quality)
         name = f"{len(self.levels) - 1 - number}/{self.written}.glb"
         self.written += 1
         self.add(name, data)
         below = self._below(number, cell)
-        points = level.mesh.v_pos[level.mesh.t_pos_idx[faces].unique()].double().numpy() @ self.to_tileset.T
+        points = level.mesh.v_pos[level.mesh.t_pos_idx[faces]].double().view(-1, 3).numpy() @ self.to_tileset.T
         errors = [level.error_of(faces) if number else 0.0, *(tile["geometricError"] for tile in below)]
         volume = _box(np.concatenate([points, *map(corners_of, below)]))
         tile = {**volume, "geometricError": max(errors), "content": {"uri": name}}
@@ -116,14 +128,14 @@ class _Tiler:
 
     def _below(self, number: int, cell: Cell) -> list[Tile]:
         """The tiles of the next finer level, whose cells are quarters of those that are not cut further."""
+        if number == 0:
+            return []
         depth = 2 * (len(self.levels) - number)
-        return (
-            [tile for part in cell.parts(depth, self.levels) for tile in self._tiles(number - 1, part)]
-            if number
-            else []
-        )
+        return [tile for part in cell.parts(depth, self.levels) for tile in self._tiles(number - 1, part)]
 
     def _encoded(self, level: Level, faces: Tensor, quality: int = JPEG_QUALITY) -> bytes:
+        if self.monitor.stop_requested():
+            raise Stopped("stopped while tiles were made; resume makes all of them again")
         write_pages(self.scratch, [cut_out(level.model, faces)], level.normals, self.up_axis, quality)
         return self.scratch.read_bytes()
 

@@ -124,7 +124,9 @@ class FleetCollector(Collector):
             nowhere = sum(line.jobs for line in lines if line.memory_gib > largest)
             yield GaugeMetricFamily("advtex_jobs_without_worker", "Jobs that wait and fit no living worker", nowhere)
         yield GaugeMetricFamily("advtex_redis_up", "Whether Redis answers", up)
-        yield from _so_far(self.store.counters.counts())
+        counts = self.store.counters.counts()
+        yield from _so_far(counts)
+        yield _told_apart(counts)
 
     def _jobs(self, lines: Sequence[Line]) -> Iterable[Metric]:
         counts = self.store.records.count_by_state()
@@ -219,42 +221,46 @@ def _so_far(counts: Iterable[CounterRow]) -> Iterable[Metric]:
         JOBS: CounterMetricFamily("advtex_jobs_ended", "Jobs that ended, by state", labels=["state"]),
     }
     found = {name: Tally(dict.fromkeys(labels, 0)) for name, labels in LABELS.items()}
-    counts = list(counts)
+    within, spent = defaultdict[str, Tally[int]](Tally), list[CounterRow]()
     for row in counts:
-        if row.name in families:
+        if row.name == STAGES:
+            spent.append(row)
+        elif row.name == STAGE_BUCKETS:
+            stage, _, bound = row.label.rpartition(" ")
+            within[stage][int(bound)] = row.count
+        elif row.name in families:
             found[row.name][row.label] = row.count
     for name, labels in found.items():
         for label, count in sorted(labels.items()):
             families[name].add_metric([label], count)
-    yield from families.values()
     stages = HistogramMetricFamily("advtex_stage_seconds", "Time in stages, of jobs that ended", labels=["stage"])
-    yield _filled(stages, counts, STAGES, STAGE_BUCKETS, STAGE_BOUNDS)
-    accuracy = HistogramMetricFamily(
+    for row in spent:
+        seen = within[row.label]
+        buckets = [
+            (f"{float(bound)}", float(sum(number for b, number in seen.items() if b <= bound)))
+            for bound in STAGE_BOUNDS
+        ]
+        # Releases that know no buckets count the rest.
+        stages.add_metric([row.label], [*buckets, ("+Inf", float(row.count))], row.total)
+    yield from families.values()
+    yield stages
+
+
+def _told_apart(counts: Sequence[CounterRow]) -> Metric:
+    told = HistogramMetricFamily(
         "advtex_discriminator_accuracy",
         "Share of patches that the discriminator told apart at the end of jobs that succeeded",
         labels=["preset"],
     )
-    yield _filled(accuracy, counts, ACCURACY, ACCURACY_BUCKETS, ACCURACY_BOUNDS)
-
-
-def _filled(
-    family: HistogramMetricFamily, counts: Sequence[CounterRow], name: str, of_buckets: str, bounds: Sequence[float]
-) -> HistogramMetricFamily:
-    """The histogram of the rows that count values by label, and of those that count the ones within each bound."""
-    within = defaultdict[str, Tally[float]](Tally)
+    below = {row.label: row.count for row in counts if row.name == ACCURACY_BUCKETS}
     for row in counts:
-        if row.name == of_buckets:
-            label, _, bound = row.label.rpartition(" ")
-            within[label][float(bound)] = row.count
-    for row in counts:
-        if row.name == name:
-            seen = within[row.label]
-            buckets = [
-                (f"{float(bound)}", float(sum(number for b, number in seen.items() if b <= bound))) for bound in bounds
-            ]
-            # Releases that know no buckets count the rest.
-            family.add_metric([row.label], [*buckets, ("+Inf", float(row.count))], row.total)
-    return family
+        if row.name == ACCURACY:
+            within, buckets = 0, list[tuple[str, float]]()
+            for bound in ACCURACY_BOUNDS:
+                within += below.get(f"{row.label} {bound}", 0)
+                buckets.append((f"{bound}", float(within)))
+            told.add_metric([row.label], [*buckets, ("+Inf", float(row.count))], row.total)
+    return told
 
 
 class MetricsMiddleware:

@@ -19,6 +19,7 @@ from advtex_contract.jobs import BatchView
 
 COLUMNS = ("label", "job", "state", "attempt", "steps", "gpu_seconds", "elapsed_seconds", "late", "reason")
 SHOWN = ("label", "state", "attempt", "steps", "gpu_seconds", "elapsed_seconds", "late")
+NAMED = 20  # jobs of each reason
 ALWAYS_SHOWN = ("label", "state", "gpu_seconds")
 FORMULA = ("=", "+", "-", "@", "\t", "\r")  # how cells begin that spreadsheets would compute
 NOTE = (
@@ -93,14 +94,18 @@ def _page(batch: BatchView, rows: Sequence[Row], thumbnails: Mapping[str, bytes]
 
 
 def _reasons(rows: Sequence[Row]) -> str:
-    """Show why jobs failed or wait, each reason once with all that have it."""
+    """Show why jobs failed or wait, each reason once with those that have it."""
     found: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         if row.get("reason"):
             found.setdefault((row["state"], row["reason"]), []).append(row)
     items = []
     for (state, reason), having in found.items():
-        links = ", ".join(f'<a href="#{escape(row["job"])}">{escape(row["label"] or row["job"])}</a>' for row in having)
+        links = ", ".join(
+            f'<a href="#{escape(row["job"])}">{escape(row["label"] or row["job"])}</a>' for row in having[:NAMED]
+        )
+        if len(having) > NAMED:
+            links += f" and {len(having) - NAMED} more"
         told = f'<span class="state {escape(state)}">{escape(state)}</span>: {links}'
         items.append(f'<li>{told}<p class="reason">{escape(reason)}</p></li>')
     return f"<h2>Failed, or waiting</h2>\n<ul>{''.join(items)}</ul>" if items else ""

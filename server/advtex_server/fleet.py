@@ -159,7 +159,7 @@ def _work(row: JobRow) -> Work:
 
 def _hours(begin: float, ended: Iterable[tuple[int, str, int]]) -> list[HourView]:
     hours = [HourView(begins=begin + number * HOUR, states={}) for number in range(HOURS)]
-    for hour, state, jobs in ended:
+    for hour, state, jobs in sorted(ended):  # states in the same order in every bar and at every look
         place = hour - int(begin // HOUR)
         if 0 <= place < HOURS:
             hours[place].states[JobState(state)] = jobs

@@ -128,7 +128,7 @@ def test_the_report_is_one_page_with_csv_and_json_beside_it(connect: Connect, tm
     assert next(job for job in told["jobs"] if job["job"] == "j0")["stage_seconds"]["optimization"] == 58.04
 
 
-def test_reasons_are_told_once_with_all_that_have_them(connect: Connect, tmp_path: Path) -> None:
+def test_reasons_are_told_once_with_those_that_have_them(connect: Connect, tmp_path: Path) -> None:
     """The message of a scan that a worker could not read tells of all problems, of which there are details too."""
     places = [ErrorDetail(where=f"color/{n}.png", message="cannot be decoded", remedy="leave it out") for n in range(9)]
     why = JobError(code="x", message="color/0.png and 8 more: cannot be decoded (leave it out)", details=places)
@@ -141,6 +141,9 @@ def test_reasons_are_told_once_with_all_that_have_them(connect: Connect, tmp_pat
     links = re.findall(r'<a href="#(\w+)">(\w+)</a>', reasons)
     assert links == [("j2", "attic"), ("j0", "hall0"), ("j1", "hall1")]
     assert all(f'<tr id="{job}">' in page for job, _ in links)
+    connect({"night": [view(f"j{n}", label=f"hall{n:02}", waiting_reason="its turn comes") for n in range(23)]})
+    assert run("report", "night", "-o", tmp_path / "r.html").exit_code == 0
+    assert ">hall19</a> and 3 more<" in (tmp_path / "r.html").read_text()
 
 
 def test_columns_that_say_nothing_are_not_shown(connect: Connect, tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from rich.console import Console
 from sqlalchemy import update
 
 from advtex_contract.jobs import JobError, JobState, Progress
+from advtex_server import fleet
 from advtex_server.embedded import client_key
 from advtex_server.fleet import HOURS, FleetView, look_at_fleet
 from advtex_server.top import picture
@@ -86,6 +87,13 @@ def test_what_is_told_of_a_fleet(busy: Any) -> None:
 
 
 @pytest.mark.one_machine("Redis is away")
+def test_states_come_in_the_same_order_at_every_look() -> None:
+    ended = [(0, "succeeded", 3), (1, "rejected", 1), (0, "failed", 1), (1, "canceled", 2)]
+    told = [[list(hour.states.items()) for hour in fleet._hours(0.0, rows)] for rows in (ended, ended[::-1])]
+    assert told[0] == told[1]
+    assert told[0][0] == [("failed", 1), ("succeeded", 3)]
+
+
 def test_a_fleet_without_redis(live: Any) -> None:
     view = look_at_fleet(live.store)
     assert view.workers is None

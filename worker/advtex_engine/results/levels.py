@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Set
+from dataclasses import replace
 from pathlib import Path
 
 from torch import Tensor
@@ -23,21 +24,29 @@ QUALITIES = (95, 90, 85, 80, 70, 60, 50)
 
 
 def write_smaller(
-    out: Path, atlas: Atlas, texture: Tensor, outputs: Set[str], *, up_axis: str, name: str = "model"
+    out: Path,
+    atlas: Atlas,
+    texture: Tensor,
+    outputs: Set[str],
+    *,
+    up_axis: str,
+    normal_map: Tensor | None = None,
+    name: str = "model",
 ) -> tuple[Path, ...]:
     """Write those of `name`_mobile.glb and `name`_lod1.glb, `name`_lod2.glb that `outputs` asks for; -> their paths.
 
-    outputs: words of `advtex_options.outputs`. texture: as `export_model` takes it. Images are JPEGs.
+    outputs: words of `advtex_options.outputs`. texture: as `export_model` takes it. Images are JPEGs. normal_map: the
+    model's for phones has one as well; levels of detail are seen from far away.
     """
     files = list[Path]()
     if outputs.isdisjoint({"mobile", "lod"}):
         return ()
-    full = TexturedModel.of(atlas, texture)
+    full = TexturedModel.of(atlas, texture, normal_map)
     if "mobile" in outputs:
         files.append(out / f"{name}_mobile.glb")
         write_within(files[-1], mobile(full), MOBILE_BYTES, up_axis)
     if "lod" in outputs:
-        level = full
+        level = replace(full, normal_map=None)
         for number in range(1, LEVELS + 1):
             level = smaller(level, max(level.faces // QUARTER, LEAST_FACES), 1 / QUARTER, MOBILE_SIDE, Monitor()).model
             files.append(out / f"{name}_lod{number}.glb")
@@ -56,6 +65,6 @@ def mobile(full: TexturedModel) -> TexturedModel:
 def write_within(path: Path, model: TexturedModel, most: int, up_axis: str) -> None:
     """Write the GLB with the best JPEG by which it has at most that many bytes, or else the last of QUALITIES."""
     for quality in QUALITIES:
-        write_glb(path, model.atlas, model.texture, up_axis=up_axis, quality=quality)
+        write_glb(path, model.atlas, model.texture, up_axis=up_axis, quality=quality, normal_map=model.normal_map)
         if path.stat().st_size <= most:
             break

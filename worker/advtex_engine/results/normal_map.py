@@ -99,7 +99,7 @@ def _normals(detail: Detail, atlas: Atlas) -> Iterator[tuple[Tensor, Tensor]]:
             continue
         used, local = torch.unique(fine.t_pos_idx[inside], return_inverse=True)
         near = Mesh(fine.v_pos[used], local)
-        found = ClosestPoints(near).find(point, frame[:, 2])
+        found = ClosestPoints(near).find(point, frame[:, 2], within=reach)
         normal = F.normalize(found.mix(smooth[used], local), dim=1)
         normal = (frame @ normal[..., None])[..., 0]
         there = (found.distance <= reach) & (normal[:, 2] >= LEAST_HEIGHT)

@@ -36,9 +36,7 @@ def panel(noise: float, relief: float, cells: int = 100, everywhere: bool = Fals
         (0.0, 0.0001, False, "hardly changed"),
     ],
 )
-def test_a_map_is_worth_it_for_shape_and_not_for_noise(
-    noise: float, relief: float, everywhere: bool, why: str
-) -> None:
+def test_a_map_is_worth_it_for_shape_and_not_for_noise(noise: float, relief: float, everywhere: bool, why: str) -> None:
     fine = panel(noise, relief, everywhere=everywhere)
     coarse = decimate(fine, 2_000, Monitor())
     detail, report = find_detail(fine, coarse)

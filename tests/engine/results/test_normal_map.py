@@ -158,9 +158,7 @@ def test_what_lies_beyond_twice_the_error_is_left_alone(fine: Mesh) -> None:
 
 def test_it_has_no_more_texels_than_the_fine_mesh_has_something_to_say(fine: Mesh) -> None:
     atlas = in_strips()
-    sizes = [
-        bake_normals(Detail(sheet(cells, 0.004), atlas.mesh.v_pos, 0.01), atlas).shape[0] for cells in (64, 160)
-    ]
+    sizes = [bake_normals(Detail(sheet(cells, 0.004), atlas.mesh.v_pos, 0.01), atlas).shape[0] for cells in (64, 160)]
     assert sizes == [SIDE // 2, SIDE]
 
 
@@ -210,7 +208,7 @@ def test_the_model_for_phones_has_one_and_levels_of_detail_none(
     texture = torch.full((SIDE, SIDE, 3), 120, dtype=torch.uint8)
     made = dict[str, Any]()
     monkeypatch.setattr(levels, "MOBILE_FACES", 1_500)
-    monkeypatch.setattr(levels, "write_within", lambda path, model, *_: made.update(mobile=model))
+    monkeypatch.setattr(levels, "write_within", lambda _path, model, *_: made.update(mobile=model))
     monkeypatch.setattr(levels, "write_glb", lambda path, *_, **options: made.update({path.name: options}))
     write_smaller(tmp_path, atlas, texture, {"mobile", "lod"}, up_axis="+z", normal_map=baked)
     mobile = made.pop("mobile")

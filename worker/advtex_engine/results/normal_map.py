@@ -82,8 +82,7 @@ def _normals(detail: Detail, atlas: Atlas) -> Iterator[tuple[Tensor, Tensor]]:
     mesh, fine, reach = atlas.mesh, detail.fine, REACH * detail.error
     texels, frames, smooth = map_texels(atlas), TangentFrames.of(mesh), vertex_normals(fine)
     points = surface_points(mesh, texels)
-    corners = fine.v_pos[fine.t_pos_idx]
-    low, high = corners.amin(1), corners.amax(1)
+    low, high = _bounds(fine)
     parts = split_faces(mesh.v_pos.numpy(), mesh.t_pos_idx.numpy(), PART_FACES)
     part_of_face = torch.empty(len(mesh.t_pos_idx), dtype=torch.int64)
     for number, part in enumerate(parts):
@@ -104,3 +103,10 @@ def _normals(detail: Detail, atlas: Atlas) -> Iterator[tuple[Tensor, Tensor]]:
         normal = (frame @ normal[..., None])[..., 0]
         there = (found.distance <= reach) & (normal[:, 2] >= LEAST_HEIGHT)
         yield texels.texel[mine[there]], normal[there]
+
+
+def _bounds(mesh: Mesh) -> tuple[Tensor, Tensor]:
+    """The least and the greatest coordinates [T,3] of each face."""
+    corners = [mesh.v_pos[corner] for corner in mesh.t_pos_idx.T]
+    low, high = torch.minimum(corners[0], corners[1]), torch.maximum(corners[0], corners[1])
+    return torch.minimum(low, corners[2], out=low), torch.maximum(high, corners[2], out=high)

@@ -156,9 +156,9 @@ def test_what_lies_beyond_twice_the_error_is_left_alone(fine: Mesh) -> None:
     assert far[0, 0].tolist() == [128, 128, 255]
 
 
-def test_it_has_no_more_texels_than_the_fine_mesh_has_something_to_say(fine: Mesh) -> None:
+def test_it_has_no_more_texels_than_the_fine_mesh_has_something_to_say() -> None:
     atlas = in_strips()
-    sizes = [bake_normals(Detail(sheet(cells, 0.004), atlas.mesh.v_pos, 0.01), atlas).shape[0] for cells in (64, 160)]
+    sizes = [bake_normals(Detail(sheet(cells, 0.004), atlas.mesh.v_pos, 0.01), atlas).shape[0] for cells in (64, 200)]
     assert sizes == [SIDE // 2, SIDE]
 
 

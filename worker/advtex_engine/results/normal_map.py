@@ -32,8 +32,9 @@ from advtex_engine.mesh.tangents import TangentFrames
 from advtex_engine.render.texels import map_texels, surface_points
 
 FLAT = (128, 128, 255)
-PER_EDGE = 2
-"""Texels along an edge of the fine mesh from which on more of them tell nothing new."""
+PER_EDGE = 1
+"""Texels along an edge of the fine mesh. With 2 a sheet of waves that was 7.6 degrees off is .25 degrees off instead of
+.29, for four times the bytes and the time."""
 SCALES = (0.5, 1, 2)
 """Sides of the image that is baked, of the texture's. More than 1 is averaged to 1; at less than half, charts would
 touch each other."""

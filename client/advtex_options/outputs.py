@@ -23,7 +23,9 @@ class Output:
 
 OUTPUTS: Mapping[str, Output] = MappingProxyType(
     {
-        "obj": Output(("model.obj", "model.mtl", "model*.png"), "for modeling programs: exact, images as PNG"),
+        "obj": Output(
+            ("model.obj", "model.mtl", "model*.png"), "for modeling programs: exact, images and any normal map as PNG"
+        ),
         "glb": Output(("model.glb",), "for viewers and game engines: all faces and texels in one file"),
         "usdz": Output(("model.usdz",), "for AR on iOS", "usually"),
         "mobile": Output(

@@ -135,6 +135,7 @@ def test_a_run_leaves_models_previews_and_a_report(whole: tuple[Path, Recorder])
     assert report["surface"]["seen"] > 0.5
     assert sum(report["surface"].values()) == pytest.approx(1)
     assert set(report["mesh"].values()) == {0}, "nothing is left out of the mesh, or added to it"
+    assert "noise" in report["normal_map"]["why"], "the scan's mesh has errors all over"
     assert {"graph", "steps_per_launch", "kernels", "precision", "reasons"} <= set(report["step"])
     assert report["versions"]["torch"].startswith("2.")
 

@@ -39,11 +39,13 @@ from advtex_engine.results import (
 from advtex_engine.runtime import Stages, WorkFolder, choose_device
 from advtex_engine.stages import (
     MadeScene,
+    baked_normals,
     cached_scene,
     completed_model,
     fingerprint,
     fitting_atlas,
     fitting_view_maps,
+    keep_detail,
     method_input,
     refined_scene,
 )
@@ -104,15 +106,25 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
     touched, mean = maps[1].slot_map >= 0, given.means[1]
     with stages.run("dilation"):
         seen = touched & given.facts.get("known", touched)
+        whole = atlas
         atlas, completed = completed_model(atlas, texture, seen, made["mesh"]["made_up_faces"], config)
     texture = completed.texture
     with stages.run("export"):
         outputs = wanted(config.outputs, large=atlas.pages > 1)
+        normals = baked_normals(whole, made["normal_map"], budget.folder)
         files = export_model(
-            out, atlas, texture, up_axis=scene.up_axis, lossless=config.lossless, usdz="usdz" in outputs
+            out,
+            atlas,
+            texture,
+            up_axis=scene.up_axis,
+            lossless=config.lossless,
+            usdz="usdz" in outputs,
+            normal_map=normals,
         )
         files += write_seen(out, atlas, completed.state)
-        files += write_smaller(out, atlas, texture, outputs, up_axis=scene.up_axis, monitor=stages.monitor)
+        files += write_smaller(
+            out, atlas, texture, outputs, up_axis=scene.up_axis, normal_map=normals, monitor=stages.monitor
+        )
         files += write_compressed(out, atlas, texture, outputs, lossless=bool(config.lossless))
         if "tiles" in outputs:
             files += (write_tiles(out, atlas, texture, up_axis=scene.up_axis, monitor=stages.monitor),)
@@ -173,6 +185,7 @@ def _scene(
                 return mesh
 
             mesh, made["mesh"] = preparation.result(monitor, onto_depth if frames else None)
+            made["normal_map"] = keep_detail(preparation, stages.folder)
             capture, made["view_choice"] = capture.choose(mesh, config.max_views, monitor)
             scene = capture.scene(mesh, monitor)
             begin_charts(scene.mesh, charts)

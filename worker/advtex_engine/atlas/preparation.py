@@ -14,6 +14,7 @@ from advtex_engine.core.errors import Problem
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Mesh
 from advtex_engine.mesh.clean import clean, decimate
+from advtex_engine.mesh.detail import Detail, find_detail
 from advtex_engine.mesh.holes import close_holes
 from advtex_engine.mesh.trim import crop, drop_floaters
 from advtex_options.box import Box
@@ -30,6 +31,15 @@ class Trimmed:
     made_up_faces: int = 0
 
 
+@dataclass(frozen=True)
+class _Prepared:
+    mesh: Mesh
+    trimmed: Trimmed
+    problems: list[Problem]
+    detail: Detail | None
+    normal_map: dict[str, Any]
+
+
 class MeshPreparation:
     """Cleans, trims and decimates a mesh on a thread of its own; a context manager that leaves no thread behind.
 
@@ -44,7 +54,7 @@ class MeshPreparation:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="advtex-mesh")
         self._up_axis = "+z"
         self._reduced: Future[tuple[Mesh, list[Problem]]] | None = None  # of a mesh that moves
-        self._prepared: Future[tuple[Mesh, Trimmed, list[Problem]]] | None = None
+        self._prepared: Future[_Prepared] | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -71,16 +81,22 @@ class MeshPreparation:
                 monitor.warning(problem)
             moved = reduced if move is None else move(reduced)
             self._prepared = self._pool.submit(self._prepare, moved, self._up_axis, True)
-        mesh, trimmed, problems = self._prepared.result()
-        for problem in problems:
+        prepared = self._prepared.result()
+        for problem in prepared.problems:
             monitor.warning(problem)
-        return mesh, asdict(trimmed)
+        return prepared.mesh, asdict(prepared.trimmed)
+
+    def detail(self) -> tuple[Detail | None, dict[str, Any]]:
+        """What decimation took of the mesh that `result` gives, and the report about it, as `find_detail` has them."""
+        assert self._prepared is not None
+        prepared = self._prepared.result()
+        return prepared.detail, prepared.normal_map
 
     def _reduce(self, mesh: Mesh) -> tuple[Mesh, list[Problem]]:
         said = _Said()
         return decimate(clean(mesh), self._face_budget, said), said.problems
 
-    def _prepare(self, mesh: Mesh, up_axis: str, moves: bool) -> tuple[Mesh, Trimmed, list[Problem]]:
+    def _prepare(self, mesh: Mesh, up_axis: str, moves: bool) -> _Prepared:
         said = _Said()
         cleaned = clean(mesh)
         cropped = cleaned if self._box is None else crop(cleaned, self._box, up_axis)
@@ -98,7 +114,8 @@ class MeshPreparation:
             len(cleaned.t_pos_idx) - len(cropped.t_pos_idx),
             len(closed.t_pos_idx) - len(prepared.t_pos_idx),
         )
-        return closed, Trimmed(outside, floaters, lost, holes, added), said.problems
+        detail, normal_map = find_detail(kept, prepared)
+        return _Prepared(closed, Trimmed(outside, floaters, lost, holes, added), said.problems, detail, normal_map)
 
 
 def _floaters_dropped(floaters: int, faces: int) -> Problem:

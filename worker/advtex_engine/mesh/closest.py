@@ -6,6 +6,7 @@ own cell. Every face is cut into pieces no larger than a cell first: the box of 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 
@@ -55,11 +56,12 @@ class ClosestPoints:
         area = float(torch.linalg.vector_norm(torch.linalg.cross(side, other), dim=1).double().mean() / 2)
         self._grids = [_Grid.of(corners, (2 * area) ** 0.5)]
 
-    def find(self, points: Tensor, normals: Tensor) -> OnSurface:
+    def find(self, points: Tensor, normals: Tensor, *, within: float = math.inf) -> OnSurface:
         """The closest points of faces that look the same way, to points [N,3] with normals [N,3] of any length.
 
         Of two sides of a thin thing the one is found whose normal agrees. Beside a face the point of it is the one that
-        has its barycentrics without what is negative, which is nearly the closest.
+        has its barycentrics without what is negative, which is nearly the closest. within: metres; where nothing is as
+        near, the distance may be infinite, and the point any.
         """
         key = torch.full((len(points),), _NONE)
         left = torch.arange(len(points))
@@ -70,12 +72,12 @@ class ClosestPoints:
                 found = torch.cat(list(in_threads(search, torch.split(left, BLOCK))))
             key[left] = found
             left = left[found == _NONE]
-            if len(left) == 0:
+            if len(left) == 0 or REACH * grid.size >= within:
                 break
-        face = key & _FACE
+        face = torch.where(key == _NONE, 0, key & _FACE)
         second, third, distance2, _ = self._nearest(face, points, normals)
         weights = torch.stack((1 - second - third, second, third), 1)
-        return OnSurface(face, weights, distance2.sqrt())
+        return OnSurface(face, weights, torch.where(key == _NONE, math.inf, distance2.sqrt()))
 
     def _grid(self, level: int) -> _Grid:
         """Each has twice the cells' size of the one before it, for points that lie farther away."""

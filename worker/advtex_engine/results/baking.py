@@ -21,9 +21,11 @@ from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Atlas, Mesh
 from advtex_engine.mesh.clean import decimate
 from advtex_engine.mesh.closest import ClosestPoints
+from advtex_engine.mesh.tangents import TangentFrames
 from advtex_engine.render.pictures import to_bytes
 from advtex_engine.render.texels import map_texels, surface_points
-from advtex_engine.render.texture import fill_holes
+from advtex_engine.render.texture import fill_holes, sample_image
+from advtex_engine.results.normal_map import decode_normals, encode_normals, flat_map
 
 SOFTENED = 1.4
 """Texels of the source along a texel's side: from here on the source is averaged before it is sampled, else it would
@@ -40,16 +42,17 @@ ROW = 1 << 14  # samples in a row: OpenCV takes no more than 32,767
 
 @dataclass(frozen=True)
 class TexturedModel:
-    """A model on the CPU. texture: [atlas.height,atlas.width,3] uint8 sRGB."""
+    """A model on the CPU. texture: [atlas.height,atlas.width,3] uint8 sRGB. normal_map: of `bake_normals`, if any."""
 
     atlas: Atlas
     texture: Tensor
+    normal_map: Tensor | None = None
 
     @staticmethod
-    def of(atlas: Atlas, texture: Tensor) -> TexturedModel:
+    def of(atlas: Atlas, texture: Tensor, normal_map: Tensor | None = None) -> TexturedModel:
         """texture: uint8 sRGB or float in [0,1], on any device."""
         cpu = torch.device("cpu")
-        return TexturedModel(replace(atlas, mesh=atlas.mesh.to(cpu)), torch.from_numpy(to_bytes(texture)))
+        return TexturedModel(replace(atlas, mesh=atlas.mesh.to(cpu)), torch.from_numpy(to_bytes(texture)), normal_map)
 
     @property
     def faces(self) -> int:
@@ -122,7 +125,25 @@ def bake(source: TexturedModel, mesh: Mesh, share: float, side: int, monitor: Mo
     image = cv2.resize(filled, (atlas.width, atlas.height), interpolation=cv2.INTER_AREA)
     image = to_bytes(torch.from_numpy(_sharpened(image) if averaged or finer > 1 else image) / 255)
     apart = points.distance[texels.barycentric.amin(1) >= 0].numpy()  # other texels lie beside their face
-    return Baked(TexturedModel(atlas, torch.from_numpy(image)), float(np.quantile(apart, 0.999)))
+    model = TexturedModel(atlas, torch.from_numpy(image), _relief(source, atlas))
+    return Baked(model, float(np.quantile(apart, 0.999)))
+
+
+def _relief(source: TexturedModel, atlas: Atlas) -> Tensor | None:
+    """The source's normal map over the atlas, as fine beside the texture as the source's; None if it has none."""
+    if source.normal_map is None:
+        return None
+    height, width, _ = source.normal_map.shape
+    size = (width * atlas.width // source.atlas.width, height * atlas.height // source.atlas.height)
+    texels = map_texels(replace(atlas, width=size[0], height=size[1]))
+    frame = TangentFrames.of(atlas.mesh).at(texels.face, texels.barycentric)
+    points = source.closest.find(surface_points(atlas.mesh, texels), frame[:, 2])
+    uv = points.mix(*_uv(source.atlas.mesh))
+    own = decode_normals(sample_image(source.normal_map, uv * uv.new_tensor([width, height])))
+    world = own[:, None] @ TangentFrames.of(source.atlas.mesh).at(points.face, points.barycentric)
+    image = flat_map(*size)
+    image.view(-1, 3)[texels.texel] = encode_normals((frame @ world.mT)[..., 0])
+    return image
 
 
 def _sampled(source: TexturedModel, uv: Tensor, *, soft: bool) -> Tensor:

@@ -4,6 +4,11 @@ OBJ keeps the scan's world coordinates; its v counts from the image's bottom row
 glTF is +Y up: the GLB's node turns the scan's up axis there and leaves the vertices as they are; its uv has the
 same origin as ours. All carry smooth normals, and one material and sRGB image for each page of the atlas: the OBJ a
 PNG, the GLB and the USDZ (`usdz.py`) a JPEG unless they are asked for a PNG.
+
+A normal map lies beside the texture, for viewers that light the model; none is needed for the texture, which has the
+light of the place in it. No tangents are written: viewers make them of the uv, of each vertex as MikkTSpace does or of
+each pixel, and on a relief with 78 charts the second way is .04 degrees worse than the first, of which the map was
+baked, where the map takes the error from 11.4 degrees to 1.4. They would cost 16 bytes a vertex.
 """
 
 from __future__ import annotations
@@ -40,34 +45,51 @@ def export_model(
     up_axis: str,
     lossless: bool = False,
     usdz: bool = False,
+    normal_map: Tensor | None = None,
     name: str = "model",
 ) -> tuple[Path, ...]:
     """Write `name`.obj, .mtl, .png, .glb and with `usdz` .usdz into the folder `out`; returns their paths.
 
     texture: [atlas.height,atlas.width,3] uint8 sRGB, or float in [0,1] (clamped). Pages after the first are
-    `name`_2.png and so on; a page without faces is left out. lossless: GLB and USDZ carry PNGs as well. Each file
-    is whole or absent; the OBJ comes after the files that it names.
+    `name`_2.png and so on; a page without faces is left out. lossless: GLB and USDZ carry PNGs as well. normal_map: of
+    `normal_map.bake_normals`, in all of them; the OBJ's is `name`_normal.png. Each file is whole or absent; the OBJ
+    comes after the files that it names.
     """
     assert texture.shape == (atlas.height, atlas.width, 3)
     assert up_axis in TO_Y_UP
     out.mkdir(parents=True, exist_ok=True)
     normals = vertex_normals(on_cpu(atlas.mesh))
-    pages = split_pages(atlas, texture)
+    pages = split_pages(atlas, texture, normal_map)
     obj, mtl, glb, package = (out / f"{name}.{suffix}" for suffix in ("obj", "mtl", "glb", "usdz"))
     images = [out / f"{name}{page.suffix}.png" for page in pages]
     for image, page in zip(images, pages, strict=True):
         write_atomically(image, encode_png(page.image))
-    write_atomically(mtl, "\n".join(map(_mtl, pages, images)).encode())
+    reliefs = dict[str, Path]()
+    for page in pages:
+        if page.normal_map is not None:
+            reliefs[page.suffix] = out / f"{name}_normal{page.suffix}.png"
+            write_atomically(reliefs[page.suffix], encode_png(page.normal_map))
+    materials = (_mtl(page, image, reliefs.get(page.suffix)) for page, image in zip(pages, images, strict=True))
+    write_atomically(mtl, "\n".join(materials).encode())
     _write_obj(obj, pages, normals, mtl.name)
     _write_glb(glb, pages, normals, up_axis, lossless)
     if usdz:
         write_usdz(package, pages, normals, up_axis, lossless=lossless)
-    return obj, mtl, *images, glb, *([package] if usdz else ())
+    return obj, mtl, *images, *reliefs.values(), glb, *([package] if usdz else ())
 
 
-def write_glb(path: Path, atlas: Atlas, texture: Tensor, *, up_axis: str, quality: int = JPEG_QUALITY) -> None:
+def write_glb(
+    path: Path,
+    atlas: Atlas,
+    texture: Tensor,
+    *,
+    up_axis: str,
+    quality: int = JPEG_QUALITY,
+    normal_map: Tensor | None = None,
+) -> None:
     """The GLB alone, its images JPEGs; `export_model` describes the rest."""
-    write_pages(path, split_pages(atlas, texture), vertex_normals(on_cpu(atlas.mesh)), up_axis, quality)
+    pages = split_pages(atlas, texture, normal_map)
+    write_pages(path, pages, vertex_normals(on_cpu(atlas.mesh)), up_axis, quality)
 
 
 def write_pages(path: Path, pages: Sequence[Page], normals: Tensor, up_axis: str, quality: int = JPEG_QUALITY) -> None:
@@ -78,9 +100,14 @@ def write_pages(path: Path, pages: Sequence[Page], normals: Tensor, up_axis: str
 # OBJ
 
 
-def _mtl(page: Page, image: Path) -> str:
-    """A material that shows the texture as it is: diffuse only (illum 1), no highlight."""
-    return f"newmtl {page.material}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {image.name}\n"
+def _mtl(page: Page, image: Path, relief: Path | None) -> str:
+    """A material that shows the texture as it is: diffuse only (illum 1), no highlight.
+
+    `norm` is the word of MTL's extension for physically based materials: a normal map under `map_Bump` would be taken
+    for heights by those who go by the book.
+    """
+    norm = "" if relief is None else f"norm {relief.name}\n"
+    return f"newmtl {page.material}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {image.name}\n{norm}"
 
 
 def _write_obj(path: Path, pages: Sequence[Page], normals: Tensor, mtl: str) -> None:
@@ -136,9 +163,15 @@ def _write_glb(
         targets = (GLTF_ELEMENT_ARRAY_BUFFER, GLTF_ARRAY_BUFFER, GLTF_ARRAY_BUFFER, GLTF_ARRAY_BUFFER)
         views = [add_view(array.tobytes(), target) for array, target in zip(arrays, targets, strict=True)]
         _add_page(document, page, arrays, views)
-        image = encode_texture(page.image, lossless=lossless, quality=quality)
-        view = {"bufferView": add_view(image.data, None), "mimeType": image.media_type}
-        document["images"].append({"name": f"texture{page.suffix}", **view})
+        named = [(f"texture{page.suffix}", page.image)]
+        if page.normal_map is not None:
+            document["materials"][-1]["normalTexture"] = {"index": len(document["textures"]) + 1}
+            named.append((f"normals{page.suffix}", page.normal_map))
+        for image_name, texels in named:
+            image = encode_texture(texels, lossless=lossless, quality=quality)
+            view = {"bufferView": add_view(image.data, None), "mimeType": image.media_type}
+            document["textures"].append({"source": len(document["images"]), "sampler": 0})
+            document["images"].append({"name": image_name, **view})
     document["buffers"] = [{"byteLength": offset}]
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
@@ -177,12 +210,13 @@ def _gltf(up_axis: str) -> dict[str, Any]:
 
 
 def _add_page(document: dict[str, Any], page: Page, arrays: tuple[Array, ...], views: Sequence[int]) -> None:
-    """A primitive with its material and texture, which shows the image of the same number.
+    """A primitive with its material, which shows the texture that comes next.
 
     arrays: of `split_at_seams`, in the buffer views `views`.
     """
     indices, positions = arrays[:2]
     first, number = len(document["accessors"]), len(document["materials"])
+    texture = {"index": len(document["textures"])}
     vector = {"componentType": GLTF_FLOAT, "count": len(positions), "type": "VEC3"}
     index_type = GLTF_UINT16 if indices.dtype == np.uint16 else GLTF_UINT32
     document["accessors"] += [
@@ -193,6 +227,5 @@ def _add_page(document: dict[str, Any], page: Page, arrays: tuple[Array, ...], v
     ]
     attributes = {"POSITION": first + 1, "NORMAL": first + 2, "TEXCOORD_0": first + 3}
     document["meshes"][0]["primitives"].append({"attributes": attributes, "indices": first, "material": number})
-    shading = {"baseColorTexture": {"index": number}, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    shading = {"baseColorTexture": texture, "metallicFactor": 0.0, "roughnessFactor": 1.0}
     document["materials"].append({"name": page.material, "pbrMetallicRoughness": shading, "doubleSided": True})
-    document["textures"].append({"source": number, "sampler": 0})

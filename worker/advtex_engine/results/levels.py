@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Set
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 from torch import Tensor
@@ -33,20 +34,22 @@ def write_smaller(
     outputs: Set[str],
     *,
     up_axis: str,
+    normal_map: Tensor | None = None,
     name: str = "model",
     monitor: Monitor | None = None,
 ) -> tuple[Path, ...]:
     """Write those of `name`_mobile.glb and `name`_lod1.glb, `name`_lod2.glb that `outputs` asks for; -> their paths.
 
-    outputs: words of `advtex_options.outputs`. texture: as `export_model` takes it. Images are JPEGs. A model for
-    phones that misses its limits is written all the same, and a level whose charts do not fit in its image is left out:
-    the monitor is told why.
+    outputs: words of `advtex_options.outputs`. texture: as `export_model` takes it. Images are JPEGs. normal_map: the
+    model's for phones has one as well; levels of detail are seen from far away. A model for phones that misses its
+    limits is written all the same, and a level whose charts do not fit in its image is left out: the monitor is told
+    why.
     """
     monitor = monitor or Monitor()
     files = list[Path]()
     if outputs.isdisjoint({"mobile", "lod"}):
         return ()
-    full = TexturedModel.of(atlas, texture)
+    full = TexturedModel.of(atlas, texture, normal_map)
     if "mobile" in outputs:
         files.append(out / f"{name}_mobile.glb")
         model = mobile(full)
@@ -55,7 +58,7 @@ def write_smaller(
             remedy = "remove small loose pieces from the mesh, or lower the face budget or the largest texture"
             monitor.warning(Problem("mobile_limits_missed", files[-1].name, "; ".join(missed), remedy))
     if "lod" in outputs:
-        level = full
+        level = replace(full, normal_map=None)
         for number in range(1, LEVELS + 1):
             path = out / f"{name}_lod{number}.glb"
             faces = max(level.faces // QUARTER, LEAST_FACES)
@@ -107,6 +110,6 @@ def missed_limits(full: TexturedModel, model: TexturedModel, size: int) -> list[
 def write_within(path: Path, model: TexturedModel, most: int, up_axis: str) -> None:
     """Write the GLB with the best JPEG by which it has at most that many bytes, or else the last of QUALITIES."""
     for quality in QUALITIES:
-        write_glb(path, model.atlas, model.texture, up_axis=up_axis, quality=quality)
+        write_glb(path, model.atlas, model.texture, up_axis=up_axis, quality=quality, normal_map=model.normal_map)
         if path.stat().st_size <= most:
             break

@@ -17,18 +17,23 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Page:
-    """An image [h,w,3] and the faces that it covers. mesh: all vertices, and all uv as they lie on their own page."""
+    """An image [h,w,3] and the faces that it covers. mesh: all vertices, and all uv as they lie on their own page.
+
+    normal_map: [h',w',3] uint8 of the same part of the surface, if there is one.
+    """
 
     mesh: Mesh
     image: Tensor
     suffix: str
+    normal_map: Tensor | None = None
 
     @property
     def material(self) -> str:
         return f"textured{self.suffix}"
 
 
-def split_pages(atlas: Atlas, texture: Tensor) -> list[Page]:
+def split_pages(atlas: Atlas, texture: Tensor, normal_map: Tensor | None = None) -> list[Page]:
+    """normal_map: over the whole atlas as the texture is, of any size."""
     mesh, count = on_cpu(atlas.mesh), atlas.pages
     assert mesh.v_uv is not None
     assert mesh.t_uv_idx is not None
@@ -39,15 +44,21 @@ def split_pages(atlas: Atlas, texture: Tensor) -> list[Page]:
     page_of_uv = (cell[:, 1] * count + cell[:, 0]).long()
     face_page = page_of_uv[mesh.t_uv_idx]
     assert bool((face_page == face_page[:, :1]).all()), "a face crosses the border of its page"
-    width, height = atlas.width // count, atlas.height // count
     pages = list[Page]()
     for number in torch.unique(face_page[:, 0]).tolist():
         row, column = divmod(number, count)
-        image = texture[row * height : (row + 1) * height, column * width : (column + 1) * width]
+        image = _cell(texture, count, row, column)
+        normals = None if normal_map is None else _cell(normal_map, count, row, column)
         mine = face_page[:, 0] == number
         part = Mesh(mesh.v_pos, mesh.t_pos_idx[mine], v_uv, mesh.t_uv_idx[mine])
-        pages.append(Page(part, image, f"_{len(pages) + 1}" if pages else ""))
+        pages.append(Page(part, image, f"_{len(pages) + 1}" if pages else "", normals))
     return pages
+
+
+def _cell(image: Tensor, count: int, row: int, column: int) -> Tensor:
+    """One of count x count equal parts of an image [h,w,3]."""
+    height, width = image.shape[0] // count, image.shape[1] // count
+    return image[row * height : (row + 1) * height, column * width : (column + 1) * width]
 
 
 def on_cpu(mesh: Mesh) -> Mesh:

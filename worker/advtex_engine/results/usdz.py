@@ -34,16 +34,25 @@ def write_usdz(path: Path, pages: Sequence[Page], normals: Tensor, up_axis: str,
         stage = Usd.Stage.CreateNew(str(crate))
         _describe(stage, up_axis)
         for page in pages:
-            image = encode_texture(shrunk(page.image, MAX_SIDE), lossless=lossless)
-            name = f"texture{page.suffix}.{image.suffix}"
-            Path(folder, name).write_bytes(image.data)
+            image = _write_image(Path(folder, f"texture{page.suffix}"), page.image, lossless)
             mesh = _add_mesh(stage, f"/model/page{page.suffix}", page, normals)
-            material = _add_material(stage, f"/model/{page.material}", name)
+            material = _add_material(stage, f"/model/{page.material}", image)
+            if page.normal_map is not None:
+                relief = _write_image(Path(folder, f"normals{page.suffix}"), page.normal_map, lossless)
+                _add_normal_map(stage, f"/model/{page.material}", relief)
             UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
         stage.GetRootLayer().Save()
         if not UsdUtils.CreateNewARKitUsdzPackage(Sdf.AssetPath(str(crate)), str(package)):
             raise EngineError(f"{path}: usd-core could not put the model together; leave the format out")
         write_atomically(path, package.read_bytes())
+
+
+def _write_image(path: Path, texels: Tensor, lossless: bool) -> str:
+    """Its name, with the suffix of its kind."""
+    image = encode_texture(shrunk(texels, MAX_SIDE), lossless=lossless)
+    path = path.with_name(f"{path.name}.{image.suffix}")
+    path.write_bytes(image.data)
+    return path.name
 
 
 def _describe(stage: Usd.Stage, up_axis: str) -> None:
@@ -77,13 +86,8 @@ def _add_material(stage: Usd.Stage, path: str, image: str) -> UsdShade.Material:
     material = UsdShade.Material.Define(stage, path)
     reader = _add_shader(stage, f"{path}/st", "UsdPrimvarReader_float2")
     reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
-    texture = _add_shader(stage, f"{path}/texture", "UsdUVTexture")
-    texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath(f"./{image}"))
-    texture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("sRGB")
-    for axis in ("wrapS", "wrapT"):
-        texture.CreateInput(axis, Sdf.ValueTypeNames.Token).Set("clamp")
-    coordinates = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
-    texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(coordinates)
+    reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
+    texture = _add_texture(stage, path, "texture", image, "sRGB")
     surface = _add_shader(stage, f"{path}/surface", "UsdPreviewSurface")
     color = texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
     surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(color)
@@ -92,6 +96,28 @@ def _add_material(stage: Usd.Stage, path: str, image: str) -> UsdShade.Material:
     shaded = surface.CreateOutput("surface", Sdf.ValueTypeNames.Token)
     material.CreateSurfaceOutput().ConnectToSource(shaded)
     return material
+
+
+def _add_normal_map(stage: Usd.Stage, path: str, image: str) -> None:
+    """To the material at `path`; from 0 to 1 it has what counts from -1 to 1."""
+    texture = _add_texture(stage, path, "normals", image, "raw")
+    texture.CreateInput("scale", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(2, 2, 2, 1))
+    texture.CreateInput("bias", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(-1, -1, -1, 0))
+    vectors = texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
+    surface = UsdShade.Shader.Get(stage, f"{path}/surface")
+    surface.CreateInput("normal", Sdf.ValueTypeNames.Normal3f).ConnectToSource(vectors)
+
+
+def _add_texture(stage: Usd.Stage, path: str, name: str, image: str, color_space: str) -> UsdShade.Shader:
+    """The image at the coordinates of the material's reader `st`."""
+    texture = _add_shader(stage, f"{path}/{name}", "UsdUVTexture")
+    texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath(f"./{image}"))
+    texture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set(color_space)
+    for axis in ("wrapS", "wrapT"):
+        texture.CreateInput(axis, Sdf.ValueTypeNames.Token).Set("clamp")
+    coordinates = UsdShade.Shader.Get(stage, f"{path}/st").GetOutput("result")
+    texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(coordinates)
+    return texture
 
 
 def _add_shader(stage: Usd.Stage, path: str, kind: str) -> UsdShade.Shader:

@@ -9,6 +9,7 @@ from typing import Any
 from advtex_engine.core.scene import Camera, Mesh, Scene, View
 from advtex_engine.ingest.frames import FrameStore
 from advtex_engine.runtime.stage_records import Stages
+from advtex_engine.stages.normal_map import has_detail
 
 MadeScene = tuple[Scene, dict[str, Any]]
 """A scene, and the report's parts about how it was made."""
@@ -18,7 +19,7 @@ def cached_scene(stages: Stages, make: Callable[[FrameStore], MadeScene]) -> Mad
     """What `make` gives, which runs the stages up to the geometry; or what it gave an earlier attempt."""
     folder = stages.folder
     saved = folder.load("scene", (*Scene.__dataclass_fields__, "made"))
-    if saved is not None:
+    if saved is not None and has_detail(saved["made"]["normal_map"], folder):
         stages.restore("ingest", "conventions", "fusion", "geometry")
         return scene_from_dict(saved), saved["made"]
     with FrameStore(folder.path) as store:

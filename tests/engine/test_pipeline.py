@@ -380,7 +380,7 @@ def test_the_mean_method_takes_no_steps(scan: Path, tmp_path: Path) -> None:
     result = texture_scan(scan, tmp_path, config, work=tmp_path / "work", monitor=Recorder())
     assert result.report["losses"] == []
     asked_for = {"model.3tz", "model_draco.glb", "model_webp.glb"}
-    models = {path.name for path in result.files if path.name.startswith("model")}
+    models = {path.name for path in result.files if path.parent == tmp_path and path.name.startswith("model")}
     assert models == {"model.obj", "model.mtl", "model.png", "model.glb", "model_seen.png", *asked_for}
 
 

@@ -71,7 +71,8 @@ def structure(value: Any) -> Any:
     if isinstance(value, Tensor):
         return f"{str(value.dtype).removeprefix('torch.')} of {value.dim()} dimensions"
     if isinstance(value, dict):
-        ours = {str(key): part for key, part in value.items() if key != "param_groups"}  # torch's own, by its version
+        # param_groups are torch's own, by its version; of quality there is as much as there was time for.
+        ours = {str(key): part for key, part in value.items() if key not in ("param_groups", "quality")}
         return {key: structure(part) for key, part in sorted(ours.items())}
     if isinstance(value, list | tuple):
         return [structure(value[0])] if value else []

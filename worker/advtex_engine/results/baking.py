@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -130,14 +131,14 @@ def _sampled(source: TexturedModel, uv: Tensor, *, soft: bool) -> Tensor:
     image = source.texture.numpy()
     if soft:
         image = cv2.sepFilter2D(image, -1, KERNEL, KERNEL)
-    place = uv * uv.new_tensor([source.atlas.width, source.atlas.height]) - 0.5
-    rows = np.pad(place.numpy(), ((0, -len(place) % ROW), (0, 0))).reshape(-1, ROW, 2)
-    color = cv2.remap(image, rows, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    return torch.from_numpy(color.reshape(-1, 3)[: len(place)].astype(np.float32))
+    place = (uv * uv.new_tensor([source.atlas.width, source.atlas.height]) - 0.5).T.numpy()
+    x, y = np.pad(place, ((0, 0), (0, -len(uv) % ROW))).reshape(2, -1, ROW)
+    color = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return torch.from_numpy(color.reshape(-1, 3)[: len(uv)].astype(np.float32))
 
 
-def _sharpened(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[H,W,3] whose bilinear interpolation has the image as its averages, nearly (Van Cittert 1931)."""
+def _sharpened(image: NDArray[Any]) -> NDArray[Any]:
+    """[H,W,3] float32 whose bilinear interpolation has the image as its averages, nearly (Van Cittert 1931)."""
     sharp = image
     for _ in range(SHARPENED):
         sharp = sharp + image - cv2.sepFilter2D(sharp, -1, BILINEAR, BILINEAR)

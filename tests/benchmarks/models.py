@@ -52,7 +52,7 @@ from advtex_options.outputs import OUTPUTS, kind_and_purpose
 HEAD = ("file", "bytes", "faces", "texels a side", "LPIPS", "PSNR", "LPIPS to the OBJ", "LPIPS by the judge", "CPU s")
 POLL = 0.005  # seconds
 LOSSLESS = "lossless/model.glb"
-PANEL, COLUMNS, CAPTION, QUALITY = 256, 4, 18, 80  # of the picture: pixels, panels in a row, pixels, JPEG
+PANEL, COLUMNS, CAPTION, QUALITY = 224, 4, 18, 72  # of the picture: pixels, panels in a row, pixels, JPEG
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ class Judge:
         scores = self.folder / "scores.json"
         scores.unlink(missing_ok=True)
         options = ["--mesh", model, "--views", self.folder, "--ref-mesh", self.folder / "reference.ply"]
-        line = [self.program, *options, "--json", scores]
+        line = [str(word) for word in (self.program, *options, "--json", scores)]
         if model.suffix not in (".obj", ".glb") or subprocess.run(line, capture_output=True).returncode:
             return "-"
         found: float = json.loads(scores.read_text())["mean"]["lpips"]
@@ -231,49 +231,63 @@ def _panels(pictures: dict[str, Tensor]) -> NDArray[np.uint8]:
     return np.concatenate(rows)
 
 
-def section(name: str, run: Run, rows: list[list[object]]) -> str:
+def heading(run: Run) -> str:
     stages = {record["stage"]: record["seconds"] for record in run.told["stages"]}
     options, scan, total = run.told["options"], run.told["scan"], sum(stages.values())
     made = sum(run.seconds[key] for key in run.seconds if key != LOSSLESS)
     return (
-        f"\n## {name}\n\n{scan['views']} views of {scan['width']} x {scan['height']}, method {options['method']}, "
+        f"{scan['views']} views of {scan['width']} x {scan['height']}, method {options['method']}, "
         f"{len(scan['heldout'])} held out. The run took {total:.0f} s, of it the stage that writes all files "
-        f"{stages['export']:.1f} s ({stages['export'] / total:.1%}), {made:.1f} s of the CPU.\n\n"
-        f"{markdown_table(HEAD, rows)}\n![from one held-out place]({name}.jpg)\n"
+        f"{stages['export']:.1f} s ({stages['export'] / total:.1%}), {made:.1f} s of the CPU."
     )
+
+
+def section(cell: dict[str, Any]) -> str:
+    name, lines = cell["scan"], markdown_table(HEAD, [list(row.values()) for row in cell["rows"]])
+    return f"\n## {name}\n\n{cell['head']}\n\n{lines}\n![from one held-out place]({name}.jpg)\n"
 
 
 def main(line: list[str] | None = None) -> None:
     arguments = arguments_of(line)
     lpips = needed_lpips(arguments.lpips_weights)
     arguments.results.mkdir(parents=True, exist_ok=True)
-    body, cells = "", list[dict[str, Any]]()
     with tempfile.TemporaryDirectory(prefix="advtex-models-") as scratch:
         scans = {scan.stem: scan for scan in arguments.scans}
         if arguments.synthetic:
             scans["synthetic"] = Path(scratch) / "synthetic"
             synthesize(scans["synthetic"])
         for name, scan in scans.items():
-            watch = Stopwatch()
-            config = TextureConfig(
-                method=arguments.method,
-                size=None if name == "synthetic" else parsed_size(arguments.size),
-                holdout=arguments.holdout,
-                outputs=",".join(OUTPUTS),
-                device=arguments.device,
-            )
-            run = textured(scan, config, (arguments.runs or Path(scratch) / "runs") / name)
-            scene = ingest(scan, config, Monitor())
-            judge = Judge(arguments.judge, Path(scratch) / f"{name}_views") if arguments.judge else None
-            if judge:
-                judge.prepare(scene)
-            rows = table(run, scene, lpips, judge, arguments.results / f"{name}.jpg")
-            body += section(name, run, rows)
-            day = datetime.datetime.now(datetime.UTC).date().isoformat()
-            told = {"scan": name, "rows": [dict(zip(HEAD, row, strict=True)) for row in rows]}
-            cells.append({**told, "date": day, "command": command(), "seconds": watch.seconds})
-            write_atomically(arguments.results / "models.json", json.dumps({"cells": cells}, indent=1).encode() + b"\n")
-            write_report(arguments.results / "models.md", "Files of a result", cells, body)
+            keep(arguments.results, cell_of(arguments, name, scan, Path(scratch), lpips))
+
+
+def cell_of(arguments: argparse.Namespace, name: str, scan: Path, scratch: Path, lpips: Lpips) -> dict[str, Any]:
+    watch = Stopwatch()
+    config = TextureConfig(
+        method=arguments.method,
+        size=None if name == "synthetic" else parsed_size(arguments.size),
+        holdout=arguments.holdout,
+        outputs=",".join(OUTPUTS),
+        device=arguments.device,
+    )
+    run = textured(scan, config, (arguments.runs or scratch / "runs") / name)
+    scene = ingest(scan, config, Monitor())
+    judge = Judge(arguments.judge, scratch / f"{name}_views") if arguments.judge else None
+    if judge:
+        judge.prepare(scene)
+    rows = table(run, scene, lpips, judge, arguments.results / f"{name}.jpg")
+    day = datetime.datetime.now(datetime.UTC).date().isoformat()
+    told = {"date": day, "command": command(), "seconds": round(watch.seconds, 1)}
+    return {"scan": name, "head": heading(run), "rows": [dict(zip(HEAD, row, strict=True)) for row in rows], **told}
+
+
+def keep(results: Path, cell: dict[str, Any]) -> None:
+    """The scan's cell in models.json in place of an older one, and models.md written anew."""
+    path = results / "models.json"
+    cells = json.loads(path.read_text())["cells"] if path.exists() else []
+    cells = [one for one in cells if one["scan"] != cell["scan"]] + [cell]
+    write_atomically(path, json.dumps({"cells": cells}, indent=1).encode() + b"\n")
+    body = "".join(section(one) for one in cells)
+    write_report(results / "models.md", "Files of a result", cells, body)
 
 
 if __name__ == "__main__":

@@ -80,4 +80,4 @@ def test_every_file_has_a_line_with_what_others_read_of_it(tmp_path: Path, monke
     assert "it the stage that writes all files 1.0 s (10.0%)" in page
     picture = cv2.imread(str(tmp_path / "square.jpg"))
     assert picture is not None
-    assert picture.shape == (2 * (192 + models.CAPTION), 4 * 256, 3)
+    assert picture.shape == (2 * (models.PANEL * 3 // 4 + models.CAPTION), 4 * models.PANEL, 3)

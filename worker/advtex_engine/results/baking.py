@@ -152,10 +152,10 @@ def _sampled(source: TexturedModel, uv: Tensor, *, soft: bool) -> Tensor:
     image = source.texture.numpy()
     if soft:
         image = cv2.sepFilter2D(image, -1, KERNEL, KERNEL)
-    place = uv * uv.new_tensor([source.atlas.width, source.atlas.height]) - 0.5
-    across, down = np.pad(place.numpy().T, ((0, 0), (0, -len(place) % ROW))).reshape(2, -1, ROW)
-    color = cv2.remap(image, across, down, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    return torch.from_numpy(color.reshape(-1, 3)[: len(place)].astype(np.float32))
+    place = (uv * uv.new_tensor([source.atlas.width, source.atlas.height]) - 0.5).T.numpy()
+    x, y = np.pad(place, ((0, 0), (0, -len(uv) % ROW))).reshape(2, -1, ROW)
+    color = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return torch.from_numpy(color.reshape(-1, 3)[: len(uv)].astype(np.float32))
 
 
 def _sharpened(image: NDArray[Any]) -> NDArray[Any]:

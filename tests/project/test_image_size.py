@@ -13,7 +13,7 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 DOCKERFILE, WORKER = (
-    (ROOT / "docker" / f"{name}.Dockerfile").read_text(encoding="utf-8") for name in ("server", "worker")
+    (ROOT / "docker" / name).read_text(encoding="utf-8") for name in ("server.Dockerfile", "worker.Dockerfile")
 )
 BUDGET = 250e6
 BASE = 130e6  # of python:3.12-slim-bookworm, unpacked; rounded up

@@ -253,22 +253,22 @@ def test_the_game_ends_where_the_run_ends(tmp_path: Path, weights: Path, monkeyp
     for module in (paper, game):
         for name, value in {"SIZE": "64x64", "VIEWS": 6, "FACES": 600, "SCAN_FACES": 600, "HOLDOUT": 3}.items():
             monkeypatch.setattr(module, name, value)
-    line = [str(tmp_path / "desk"), "--scan-size", "96x64", "--errors", "cameras", "--levels", "1", "--steps", "4"]
+    line = [str(tmp_path / "desk"), "--scan-size", "96x64", "--errors", "--steps", "4"]
     line += ["--device", "cpu", "--lpips-weights", str(weights)]
     paper.main([*line, "--rows", "adversarial", "--results", str(tmp_path / "paper")])
     changed = ["--change", "start=selection", "lr_texture=1e-2"]
     for change in ([], changed):
         game.main([*line, "--points", "2", *change, "--results", str(tmp_path / "game")])
     readings = json.loads((tmp_path / "game" / "game.json").read_text())["cells"]
-    assert [cell["settings"]["step"] for cell in readings] == [0, 1, 2, 3, 4] * 4
+    assert [cell["settings"]["step"] for cell in readings] == [0, 1, 2, 3, 4] * 2
     for cell in readings:
         assert ({"gradient_adversarial", "gradient_l1"} <= set(cell["scores"])) == (cell["settings"]["step"] > 0)
     assert {"accuracy_real", "accuracy_fake", "margin", "spread"} <= set(readings[9]["scores"])
     cells = [cell for cell in readings if "lpips" in cell["scores"]]
-    assert [cell["settings"]["step"] for cell in cells] == [0, 2, 4] * 4
+    assert [cell["settings"]["step"] for cell in cells] == [0, 2, 4] * 2
     assert (tmp_path / "game" / "game.png").stat().st_size > 1000
     usual = [cell for cell in cells if not cell["settings"]["changes"]]
-    assert [cell["scores"]["lpips"] for cell in usual] != [cell["scores"]["lpips"] for cell in cells[6:]]
+    assert [cell["scores"]["lpips"] for cell in usual] != [cell["scores"]["lpips"] for cell in cells[3:]]
     ends = {cell["settings"]["scan"]: cell["scores"] for cell in usual if cell["settings"]["step"] == 4}
     for cell in json.loads((tmp_path / "paper" / "paper.json").read_text())["cells"]:
         assert ends[cell["settings"]["scan"]]["lpips"] == pytest.approx(cell["scores"]["lpips"], abs=1e-6)

@@ -14,8 +14,8 @@ def test_a_tiny_fleet_is_measured(tmp_path: Path, postgres_server: str) -> None:
     results = Results(tmp_path / "fleet.json")
     for database, server in (("sqlite", None), ("postgresql", postgres_server)):
         for jobs in (40, 80):
-            fleet.run(fleet.Fleet(database, jobs, 6, seconds=1.0), False, results, server)
-            fleet.run(fleet.Fleet(database, jobs, 6, seconds=1.0), True, results, server)
+            fleet.run(fleet.Fleet(database, jobs, 2, seconds=0.5), False, results, server)
+            fleet.run(fleet.Fleet(database, jobs, 2, seconds=0.5), True, results, server)
     page = fleet.report(results.cells)
     assert page.count("| postgresql |") == page.count("| sqlite |") == 4
     assert page.count("grows with jobs") == 4

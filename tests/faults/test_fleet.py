@@ -18,7 +18,7 @@ from tiny_scan import write_zip
 from advtex_store.models import JobRow
 from advtex_store.records import POISON_DEATHS
 
-SCENES = 30
+SCENES = 16
 STEPS = 40
 
 

@@ -177,12 +177,29 @@ class Judge:
         """A dash for files that it does not read."""
         scores = self.folder / "scores.json"
         scores.unlink(missing_ok=True)
+        if model.suffix == ".glb":
+            model = in_scans_world(model, self.folder / "model.glb")
         options = ["--mesh", model, "--views", self.folder, "--ref-mesh", self.folder / "reference.ply"]
         line = [str(word) for word in (self.program, *options, "--json", scores)]
         if model.suffix not in (".obj", ".glb") or subprocess.run(line, capture_output=True).returncode:
             return "-"
         found: float = json.loads(scores.read_text())["mean"]["lpips"]
         return found
+
+
+def in_scans_world(glb: Path, copy: Path) -> Path:
+    """A copy of a GLB without its node's turn to +Y up, which another program would have to guess."""
+    data = glb.read_bytes()
+    length = int.from_bytes(data[12:16], "little")
+    document = json.loads(data[20 : 20 + length])
+    for node in document["nodes"]:
+        node.pop("rotation", None)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    size = len(data) - length + len(text)
+    head = data[:8] + size.to_bytes(4, "little") + len(text).to_bytes(4, "little") + data[16:20]
+    copy.write_bytes(head + text + data[20 + length :])
+    return copy
 
 
 def table(run: Run, scene: Scene, lpips: Lpips, judge: Judge | None, sheet: Path) -> list[list[object]]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import mimetypes
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from pydantic import BaseModel, ValidationError
@@ -52,9 +53,15 @@ class Results:
         self.blobs = blobs
 
     def commit(
-        self, job_id: str, attempt: int, files: Mapping[str, Path], warnings: Sequence[ErrorDetail] = ()
+        self,
+        job_id: str,
+        attempt: int,
+        files: Mapping[str, Path],
+        warnings: Sequence[ErrorDetail] = (),
+        *,
+        closing: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> ResultManifest:
-        """Upload `files` (name for the user -> local path) and end the job as `succeeded`.
+        """Upload `files` (name for the user -> local path) and end the job as `succeeded`, the latter within `closing`.
 
         Returns the manifest that counts: an earlier attempt's, if that one had written its manifest first.
         StaleAttempt: the lease was lost before anything could be seen.
@@ -73,7 +80,8 @@ class Results:
         self.records.heartbeat(job_id, attempt)
         if not self.blobs.put_if_absent(keys.result_manifest_key(job_id), manifest.model_dump_json().encode()):
             manifest = self.manifest(job_id)
-        self.records.succeed(job_id, attempt, [f.model_dump() for f in manifest.files], manifest.warnings)
+        with closing():
+            self.records.succeed(job_id, attempt, [f.model_dump() for f in manifest.files], manifest.warnings)
         return manifest
 
     def adopt(self, job_id: str) -> bool:

@@ -52,25 +52,25 @@ def submit(manifest: Path, url: str, key: str, home: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def one_at_work(running: Fleet, after: int) -> int:
-    """The number of a worker that has a runner, another one each time where there are several.
+def one_at_work(running: Fleet, after: int) -> int | None:
+    """The number of a worker that has a runner, another one each time where there are several; None if no job is left.
 
     Three deaths in a row without progress are poison, and a kill may come before the first step: a job that has died
     twice is left in peace.
     """
     found: list[int] = []
 
-    def look() -> list[int]:
+    def look() -> bool:
         with running.store.database.read() as session:
             at_work = session.query(JobRow).filter(JobRow.state == "running", JobRow.deaths < POISON_DEATHS - 1)
             horses = {int(str(row.worker).rpartition("-")[2]) for row in at_work}
         order = ((after + n) % len(running.workers) for n in range(len(running.workers)))
         trees = ((n, process_tree(running.workers[n].pid)) for n in order)
         found.extend(n for n, tree in trees if len(tree) > 2 and horses & set(tree))  # itself, RQ's horse, runner
-        return found
+        return bool(found) or running.store.records.count_by_state().get("succeeded", 0) == SCENES
 
     wait_until(look, seconds=60)
-    return found[0]
+    return found[0] if found else None
 
 
 @pytest.mark.slow
@@ -96,6 +96,8 @@ def test_a_batch_finishes_while_its_workers_are_killed(
         for goal in range(3, SCENES, 4):
             wait_until(lambda: succeeded() >= goal, seconds=120)  # noqa: B023
             victim = one_at_work(running, after=goal)
+            if victim is None:  # a fast machine
+                break
             kill_tree(running.workers[victim].pid)
             running.workers[victim].wait()
             running.workers[victim] = running.start_worker(victim)

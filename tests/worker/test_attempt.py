@@ -49,16 +49,22 @@ def test_a_job_succeeds_with_results_warnings_and_progress(
     assert list(settings.workspaces.iterdir()) == []
 
 
-def test_a_job_that_is_done_loses_no_lease_while_its_checkpoints_are_removed(
+def test_a_job_that_is_done_loses_no_lease(
     store: Store, host: Hosts, new_job: NewJob, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    delete = type(store.blobs).delete_prefix
+    delete, succeed = type(store.blobs).delete_prefix, type(store.records).succeed
 
-    def slowly(*arguments: Any) -> Any:
+    def delete_slowly(*arguments: Any) -> Any:
         time.sleep(0.2)  # some heartbeats
         return delete(*arguments)
 
-    monkeypatch.setattr(type(store.blobs), "delete_prefix", slowly)
+    def succeed_slowly(*arguments: Any) -> Any:
+        done = succeed(*arguments)
+        time.sleep(0.2)
+        return done
+
+    monkeypatch.setattr(type(store.blobs), "delete_prefix", delete_slowly)
+    monkeypatch.setattr(type(store.records), "succeed", succeed_slowly)
     job_id = new_job(steps=3)
     with capture_logs() as lines:
         run_attempt(host("stepping"), job_id, 1)

@@ -19,6 +19,7 @@ import psutil
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from structlog.testing import capture_logs
 
 from advtex_contract.jobs import Progress
 from advtex_contract.options import JobOptions, Preset, chosen_options
@@ -299,6 +300,27 @@ def test_a_stale_attempt_is_told_once_and_overrules_a_cancel() -> None:
     kept.end(Ending.preempt)
     assert endings == [Ending.cancel, Ending.lost]
     assert kept.ending is Ending.lost
+
+
+def test_an_attempt_that_is_being_ended_has_no_lease_to_lose() -> None:
+    records, endings = FakeRecords(), []
+    kept = keeper(records, endings.append)
+    records.answer = StaleAttempt("it has succeeded")
+    with capture_logs() as lines:
+        with kept.closing():
+            assert not kept.beat()
+        kept.turn()
+    assert (endings, lines) == ([], [])
+
+
+def test_an_attempt_whose_end_could_not_be_recorded_can_still_be_lost() -> None:
+    records, endings = FakeRecords(), []
+    kept = keeper(records, endings.append)
+    with pytest.raises(ConnectionError), kept.closing():
+        raise ConnectionError("no route")
+    records.answer = StaleAttempt("moved on")
+    kept.beat()
+    assert endings == [Ending.lost]
 
 
 def test_the_row_is_written_every_few_seconds_and_watchers_see_more(monkeypatch: pytest.MonkeyPatch) -> None:

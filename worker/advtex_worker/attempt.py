@@ -250,7 +250,9 @@ class Attempt:
         tail = self._log_tail()
         if isinstance(ended, FinishedEvent):
             self._patience.transfer(
-                lambda: self._store.results.commit(job_id, number, self._space.results(), self._warnings)
+                lambda: self._store.results.commit(
+                    job_id, number, self._space.results(), self._warnings, closing=self._keeper.closing
+                )
             )
             self._keeper.stop()  # of a job that has ended there is no lease to be lost
             with suppress(Exception):  # they are only worth their space now; deleting the job removes them too

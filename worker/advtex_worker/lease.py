@@ -5,7 +5,8 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 
 import structlog
@@ -65,6 +66,7 @@ class LeaseKeeper:
         self._held_until = self._until()
         self._next_beat = _now() + self._rest()  # the claim has just been one
         self._done = threading.Event()
+        self._closed = False
         self._beating = threading.Lock()
         self._deciding = threading.Lock()
         self._counting = threading.Lock()
@@ -107,6 +109,19 @@ class LeaseKeeper:
             if self.ending is None or ending is Ending.lost:
                 self.ending = ending
             self._on_ending(ending)
+
+    @contextmanager
+    def closing(self) -> Iterator[None]:
+        """While the rows are told how the attempt ends, and after: a heartbeat that finds it ended has lost nothing.
+
+        An error leaves the attempt as it was before.
+        """
+        self._closed = True
+        try:
+            yield
+        except BaseException:
+            self._closed = False
+            raise
 
     def beat(self) -> bool:
         """Renew now. -> whether the attempt still holds its job."""
@@ -157,6 +172,8 @@ class LeaseKeeper:
         try:
             lease = ask()
         except StaleAttempt as error:
+            if self._closed:
+                return False
             log.warning("lease lost", job=self._job_id, attempt=self._attempt, reason=str(error))
             self.end(Ending.lost)
             return False

@@ -61,7 +61,8 @@ class Patience:
         """Tell the rows how it ended, again until they answer or the lease is lost (Interrupted)."""
         while self._keeper.ending is not Ending.lost:
             try:
-                return action()
+                with self._keeper.closing():
+                    return action()
             except SQLAlchemyError as error:
                 self._log.warning("the end cannot be recorded, trying again", error=str(error))
             time.sleep(0.5)

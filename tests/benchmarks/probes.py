@@ -247,10 +247,10 @@ def report(arguments: argparse.Namespace, results: Results) -> None:
         "ended",
         "best",
         "LPIPS of the start",
-        "kept",
-        "best",
-        "last",
-        "looks, steps",
+        "of what is kept",
+        "of the best",
+        "of the last",
+        "looks, in steps",
     ]
     table = markdown_table(head, [[f"{cell:.4f}" if isinstance(cell, float) else cell for cell in row] for row in kept])
     told = f"Patience of {patience} turns. Where the start is the best, step is that of its end of pretraining.\n\n"

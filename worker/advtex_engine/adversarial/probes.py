@@ -28,8 +28,8 @@ from advtex_engine.render.view_maps import ViewMaps
 PARTS = 5
 """Every view is left out in one of so many turns: more parts would be smaller samples, fewer would be missed more."""
 LEAST_VIEWS = 3  # that can be drawn; of two, one would be left to play with itself
-CELL, CELLS = 128, 24
-"""Side of a cell in pixels, and how many a look takes at most: its cost is that of one or two steps."""
+CELL, CELLS, AREAS = 128, 24, 4
+"""Side of a cell in pixels, how many a look takes at most, and of how many views' area: it costs one or two steps."""
 LEAST_UNLIKE = 1e-6  # what is nearer to a photograph than this is the photograph
 
 Probed = dict[str, Any]
@@ -106,9 +106,11 @@ class LeftOutCells:
         self._corners = torch.tensor([top * maps.width + left for top, left in corners], device=maps.device)
 
     def of(self, views: list[int]) -> list[_Cells]:
-        """At most CELLS of these views, in each those with the most pixels that can be judged; none without any."""
-        some = views if len(views) <= CELLS else evenly_spread(views, CELLS)
-        found = [self._cells(view, CELLS // len(some)) for view in some]
+        """Cells of these views, in each those with the most pixels that can be judged; none without any."""
+        area = self.maps.width * self.maps.height / (self.width * self.height)
+        most = min(CELLS, int(AREAS * area))
+        some = views if len(views) <= most else evenly_spread(views, most)
+        found = [self._cells(view, most // len(some)) for view in some]
         return [cells for cells in found if len(cells.photograph)]
 
     def unlike(self, cells: list[_Cells], values: Tensor) -> float:

@@ -21,9 +21,9 @@ from advtex_engine.selection.mrf import assign_views
 class Selection:
     """texture: [H,W,3] float32 in [0,1], filled where not known. known: [H,W] bool, texels that a view shows.
 
-    painted: [H,W] int16, the view that each texel shows, -1 where not known. labels: [T] int64 view of each face, -1 =
-    none. confidence: [H,W] float32 in [0,1], lower where the view disagrees with the face's other views and along seams, 0
-    where not known.
+    painted: [H,W] int16, the view that each texel shows, -1 where not known. confidence: [H,W] float32 in [0,1], lower
+    where the view disagrees with the face's other views and along seams, 0 where not known. labels: [T] int64 view of
+    each face, -1 = none.
     """
 
     texture: Tensor

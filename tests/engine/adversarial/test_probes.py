@@ -272,6 +272,7 @@ def test_no_step_of_a_turn_knows_a_view_that_is_left_out() -> None:
             generator=torch.Generator().manual_seed(0),
             discriminator=PatchDiscriminator(torch.Generator().manual_seed(0)),
         )
+        optimizer.bfloat16 = False  # faster, where the crops are as small as these
         optimizer.index = preset.pretraining
         left_out = torch.zeros(VIEWS, dtype=torch.bool)
         left_out[0::PARTS] = True

@@ -19,7 +19,7 @@ Unlikeness = Callable[[Tensor, Tensor], Tensor]
 
 WINDOWS = (8, 16)  # pixels; in the second one, means of 3 x 3 pixels are compared
 STRIDE = 4  # pixels between two windows
-REACH = 2  # pixels by which a window may be off without a penalty; tried in steps of 1, and of 2 among means
+REACH = 2  # pixels by which a window may be off without a penalty
 FLAT = 0.03**2  # variances well below count as none (SSIM's second constant, for colors in [0, 1])
 
 
@@ -33,23 +33,23 @@ def structure_unlikeness(renders: Tensor, photographs: Tensor) -> Tensor:
     height, width = renders.shape[-2:]
     render, photograph = renders.mean(1, keepdim=True), photographs.mean(1, keepdim=True)
     total = torch.zeros_like(render)
-    for number, size in enumerate(WINDOWS):
-        unlike = _unlike_windows(render, photograph, size, number + 1)
+    for size in WINDOWS:
+        unlike = _unlike_windows(render, photograph, size)
         grown = unlike.repeat_interleave(STRIDE, 2).repeat_interleave(STRIDE, 3)
         total += grown[..., :height, :width] / len(WINDOWS)
         render, photograph = (F.avg_pool2d(image, 3, 1, 1, count_include_pad=False) for image in (render, photograph))
     return total[:, 0]
 
 
-def _unlike_windows(render: Tensor, photograph: Tensor, size: int, step: int) -> Tensor:
+def _unlike_windows(render: Tensor, photograph: Tensor, size: int) -> Tensor:
     """[N,1,h,w] each -> [N,1,ceil(h/STRIDE),ceil(w/STRIDE)], a value per window."""
     height, width = render.shape[-2:]
     around = F.pad(render, (REACH, REACH, REACH, REACH), mode="replicate")
     mean = _windows(photograph, size)
     variance = _windows(photograph.square(), size) - mean.square()
     best = torch.full_like(mean, -1.0)
-    for down in range(0, 2 * REACH + 1, step):
-        for right in range(0, 2 * REACH + 1, step):
+    for down in range(2 * REACH + 1):
+        for right in range(2 * REACH + 1):
             moved = around[..., down : down + height, right : right + width]
             moved_mean = _windows(moved, size)
             moved_variance = _windows(moved.square(), size) - moved_mean.square()

@@ -144,12 +144,15 @@ def run_method(given: MethodInput, method: str) -> Tensor:
 
 def started(given: MethodInput) -> MethodInput:
     """With the start [H,W,3] in [0,1] that the preset has, and views in its tones if the preset wants that."""
-    start = select_views(given).texture if given.preset.start == "selection" else starting_texture(given)
+    start, painted = starting_texture(given), None
+    if given.preset.start == "selection":
+        selection = select_views(given)
+        start, painted = selection.texture, selection.painted
     maps = {scale: dataclasses.replace(level, color=level.color.clone()) for scale, level in given.maps.items()}
     if given.preset.toned:
         for level in maps.values():
             tone_views(level, start)
-    return dataclasses.replace(given, start=start, maps=maps)
+    return dataclasses.replace(given, start=start, painted=painted, maps=maps)
 
 
 def needed_lpips(folder: Path | None) -> Lpips:

@@ -53,6 +53,10 @@ class Preset:
     max_pair_angle    largest angle between the optical axes of a pair, degrees (released code: 15)
     min_pair_overlap  least share of the source's foreground that the auxiliary view sees
     nearest_share     of the views that remain for a source, rounded up, those whose warped images differ least from it
+    turn              steps, after pretraining, for which some views are left out of the game, and then judge it; only
+                      from a start of "selection" (paper: 0, never)
+    patience          turns in a row that bring nothing, after which it ends; the best state is kept. With pretraining
+                      they are less than a fifth of the steps, all that a game costs that cannot help
     auxiliary         real examples are warped auxiliary views; else the source itself (ablation, paper section 4)
     condition         the discriminator is shown the source image; else the example alone (ablation, paper section 4)
     """
@@ -79,6 +83,8 @@ class Preset:
     max_pair_angle: float = 15.0
     min_pair_overlap: float = 0.3
     nearest_share: float = 1.0
+    turn: int = 0
+    patience: int = 2
     auxiliary: bool = True
     condition: bool = True
 
@@ -133,6 +139,7 @@ STANDARD = Preset(
     l1_decays=0,
     feature_weight=10.0,
     averaging=1_000,
+    turn=60,
     alignment=True,
     max_crop=(384, 288),
 )
@@ -146,11 +153,12 @@ PRESETS: dict[str, Preset] = {
         lr_texture=1.6e-5,
         lr_discriminator=3.2e-5,
         averaging=12_000,
+        turn=2_000,
         max_crop=None,
     ),
     "standard": STANDARD,
     "preview": replace(
-        STANDARD, levels=(PyramidLevel(800, scale=2), PyramidLevel(300)), pretraining=120, averaging=100
+        STANDARD, levels=(PyramidLevel(800, scale=2), PyramidLevel(300)), pretraining=120, averaging=100, turn=40
     ),
 }
 
@@ -199,5 +207,5 @@ def resolve_preset(config: TextureConfig, device_type: str) -> Preset:
     share = config.steps / preset.steps
     levels = [PyramidLevel(round(level.steps * share), level.scale) for level in preset.levels]
     levels[-1] = PyramidLevel(config.steps - sum(level.steps for level in levels[:-1]), levels[-1].scale)
-    pretraining, averaging = int(preset.pretraining * share), int(preset.averaging * share)
-    return replace(preset, levels=tuple(levels), pretraining=pretraining, averaging=averaging)
+    pretraining, averaging, turn = (int(n * share) for n in (preset.pretraining, preset.averaging, preset.turn))
+    return replace(preset, levels=tuple(levels), pretraining=pretraining, averaging=averaging, turn=turn)

@@ -16,16 +16,20 @@ from advtex_engine.adversarial.disagreement import disagreement
 from advtex_engine.adversarial.discriminator import PatchDiscriminator
 from advtex_engine.adversarial.game import GAME_NAMES, problems, recent_accuracy, summary
 from advtex_engine.adversarial.optimizer import LOSS_NAMES, AdversarialOptimizer
+from advtex_engine.adversarial.probes import LeftOutCells, Probed, Probes, probed
+from advtex_engine.adversarial.schedule import AVERAGE_EVERY
+from advtex_engine.adversarial.unlikeness import structure_unlikeness
 from advtex_engine.core.config import Preset
 from advtex_engine.core.errors import Diverged, Problem, Stopped
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.methods.mean import dense_texture
+from advtex_engine.metrics.evaluate import configured_lpips
 from advtex_engine.render.pairs import Pairs, own_pairs, related_pairs
 from advtex_engine.render.streaming import PairViews, pair_views
 from advtex_engine.render.view_maps import ViewMaps
 from advtex_engine.runtime.checkpoint import Checkpoints
 
-NEEDED = ("level", "step", "losses", "quality", "halved", "optimizer", "views")
+NEEDED = ("level", "step", "losses", "quality", "halved", "probed", "optimizer", "views", "probes")
 """What a checkpoint holds."""
 HISTORY_POINTS = 200  # means kept for the report and shown as progress
 PROBE_EVERY = 200
@@ -37,13 +41,15 @@ PROBE_EVERY_ON_GPU = 2_000  # there a step is one of many of a graph, and a look
 class _Run:
     """Where the run stands: pyramid level, global step, the history so far, and whether it goes at half the rates.
 
-    losses: means, and what the discriminator knew, since the point before.
+    losses: means, and what the discriminator knew, since the point before. probed: what the levels before were told by
+    views that were left out.
     """
 
     level: int
     step: int
     losses: list[LossPoint]
     halved: bool
+    probed: list[Probed]
 
 
 def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
@@ -90,8 +96,9 @@ def _optimized(
     # Weights are drawn on the CPU, so that a run starts from the same discriminator on every device.
     discriminator = PatchDiscriminator(torch.Generator().manual_seed(given.config.seed)).to(device)
     generator = torch.Generator(device).manual_seed(given.config.seed)
-    run = _Run(saved["level"], saved["step"], saved["losses"], halved) if saved else _Run(0, 0, [], halved)
+    run = _Run(0, 0, [], halved, [])
     if saved:
+        run = _Run(saved["level"], saved["step"], saved["losses"], halved, saved["probed"])
         given.live.quality = saved["quality"]
     start = starting_texture(given)
     texture = start
@@ -101,7 +108,8 @@ def _optimized(
         maps = given.maps[level.scale]
         # Smaller views need less room each.
         on_device = None if given.on_device is None else given.on_device * level.scale**2
-        views = pair_views(maps, pairs_of(given, maps), on_device, given.config.seed)
+        pairs = pairs_of(given, maps)
+        views = pair_views(maps, pairs, on_device, given.config.seed)
         optimizer = AdversarialOptimizer(
             views.maps,
             views.pairs,
@@ -113,19 +121,65 @@ def _optimized(
             discriminator=discriminator,
         )
         optimizer.index = run.step
+        end = sum(part.steps for part in preset.levels[: number + 1])
+        probes = _probes(given, maps, pairs, optimizer, views, end)
         if saved:
             optimizer.load_state_dict(saved["optimizer"])
+            if probes is not None:
+                probes.load_state_dict(saved["probes"], optimizer.result)
             views.load_state_dict(saved["views"])
             saved = None
-        _run_level(given, optimizer, views, run, sum(part.steps for part in preset.levels[: number + 1]), checkpoints)
-        texture = _refined(start, dense_texture(maps, optimizer.result))
-        del optimizer, views  # before the next level makes its own
+        _run_level(given, optimizer, views, probes, run, end, checkpoints)
+        helped = probes is None or probes.best is not None
+        if probes is not None:
+            run.probed.append(probes.told)
+        if helped:
+            result = optimizer.result if probes is None else probes.kept
+            texture = _refined(start, dense_texture(maps, result))
+        del optimizer, views, probes  # before the next level makes its own
         run.level = number + 1
-    given.facts["game"] = summary(run.losses, preset)
+        if not helped:
+            break
+    told = probed(run.probed, preset.steps)
+    if told is not None:
+        given.monitor.note(told["told"])
+    if run.losses[-1]["step"] < preset.steps:
+        given.monitor.progress(preset.steps, preset.steps, _shown(run.losses, preset.steps))
+    given.facts["game"] = summary(run.losses, preset) | {"probes": told}
     for problem in problems(run.losses, preset):
         given.monitor.warning(problem)
     losses = [{name: value for name, value in point.items() if name not in GAME_NAMES} for point in run.losses]
     return texture.clamp(0, 1), losses
+
+
+def _probes(
+    given: MethodInput, maps: ViewMaps, pairs: Pairs, optimizer: AdversarialOptimizer, views: PairViews, end: int
+) -> Probes | None:
+    """What says whether the level's steps pay; None where the preset asks for none, or no view can be left out.
+
+    Runs whose turns would be too short for the texture's average to move are not probed.
+    """
+    preset = given.preset
+    if given.painted is None or preset.turn < AVERAGE_EVERY:
+        return None
+    lpips, _ = configured_lpips()
+    unlikeness = structure_unlikeness if lpips is None else lpips.to(maps.device).maps
+
+    def leave_out(left_out: Tensor) -> None:
+        optimizer.sampler.source_count.fill_(views.leave_out(left_out))
+
+    probes = Probes(
+        LeftOutCells(maps, given.painted, unlikeness),
+        pairs.sources.tolist(),
+        leave_out,
+        judged_by="structure" if lpips is None else "LPIPS",
+        start=optimizer.values.detach().clone(),
+        first=max(preset.pretraining, optimizer.index),
+        end=end,
+        turn=preset.turn,
+        patience=preset.patience,
+    )
+    return probes if probes.possible else None
 
 
 def adversarial_no_auxiliary(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
@@ -157,6 +211,7 @@ def _run_level(
     given: MethodInput,
     optimizer: AdversarialOptimizer,
     views: PairViews,
+    probes: Probes | None,
     run: _Run,
     end: int,
     checkpoints: Checkpoints,
@@ -165,11 +220,16 @@ def _run_level(
     every = max(1, total // HISTORY_POINTS)
     probe_every = PROBE_EVERY_ON_GPU if optimizer.device.type == "cuda" else PROBE_EVERY
     stepper = Stepper(optimizer)
-    while run.step < end:
+    if probes is not None:
+        probes.reached(run.step, optimizer.result)
+    while run.step < end and not (probes is not None and probes.over):
         before = run.step
-        run.step += stepper.take(end - run.step)
+        run.step += stepper.take((end if probes is None else min(end, probes.next)) - run.step)
         views.advance(run.step - before)
-        if run.step // every > before // every or run.step == end:
+        if probes is not None:
+            probes.reached(run.step, optimizer.result)
+        over = run.step == end or (probes is not None and probes.over)
+        if run.step // every > before // every or over:
             losses = optimizer.drain_losses()
             _check(optimizer, losses, run, total)
             read = run.losses[-1]["step"] if run.losses else 0
@@ -177,17 +237,20 @@ def _run_level(
                 losses |= optimizer.gradient_norms()
             run.losses.append({"step": run.step, **losses})
             given.monitor.progress(run.step, total, _shown(run.losses, total))
-        if run.step == total or given.live.due():
+        if over or given.live.due():
             mean = given.means[given.preset.levels[run.level].scale]
-            given.live.show(run.step, optimizer.maps, optimizer.result, mean, run.losses)
+            shown = probes.kept if over and probes is not None else optimizer.result
+            given.live.show(run.step, optimizer.maps, shown, mean, run.losses)
         stop = given.monitor.stop_requested()
         if stop or checkpoints.due():
             _check(optimizer, {}, run, total)
             state = {"level": run.level, "step": run.step, "losses": run.losses, "quality": given.live.quality}
-            state["halved"] = run.halved
+            state |= {"halved": run.halved, "probed": run.probed}
+            state["probes"] = None if probes is None else probes.state_dict()
             checkpoints.save({**state, "optimizer": optimizer.state_dict(), "views": views.state_dict()})
         if stop:
             raise Stopped(f"stopped after step {run.step} of {total}; resume goes on from there")
+    run.step = end  # the next level begins where its schedule does, also where this one has ended before
     given.facts["step"] = stepper.describe() | {"lr_texture": optimizer.preset.lr_texture}
 
 

@@ -26,6 +26,7 @@ class MethodInput:
     means: dense textures [H,W,3] float32 in [0,1], defined on every texel.
     live: shows the texture while it is optimized.
     start: dense texture [H,W,3] that the adversarial methods start from; None: preset.start needs no more than `means`.
+    painted: [H,W] int16, the view that each texel of `start` shows, -1 = none; None: not known.
     on_device: views of full size that may be on the device at a time, while pairs are drawn; None: all are.
     facts: what the method says about how it ran, by name: "step" and "game" for the report, whose "refinement" takes
     what is under that name; "known" is [H,W] bool, where the texture shows a photograph; all that views touch, if it
@@ -42,6 +43,7 @@ class MethodInput:
     work: WorkFolder
     live: Live
     start: Tensor | None = None
+    painted: Tensor | None = None
     on_device: int | None = None
     facts: dict[str, Any] = field(default_factory=dict)
 
@@ -49,4 +51,4 @@ class MethodInput:
     def held_bytes(self) -> int:
         """Bytes of the tensors that the device holds for the method before it begins."""
         held = held_bytes(self.maps.values(), self.maps[1].device) + sum(mean.nbytes for mean in self.means.values())
-        return held + (0 if self.start is None else self.start.nbytes)
+        return held + sum(part.nbytes for part in (self.start, self.painted) if part is not None)

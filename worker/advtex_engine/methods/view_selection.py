@@ -21,12 +21,14 @@ from advtex_engine.selection.mrf import assign_views
 class Selection:
     """texture: [H,W,3] float32 in [0,1], filled where not known. known: [H,W] bool, texels that a view shows.
 
-    confidence: [H,W] float32 in [0,1], lower where the view disagrees with the face's other views and along seams, 0
-    where not known. labels: [T] int64 view of each face, -1 = none.
+    painted: [H,W] int16, the view that each texel shows, -1 where not known. confidence: [H,W] float32 in [0,1], lower
+    where the view disagrees with the face's other views and along seams, 0 where not known. labels: [T] int64 view of
+    each face, -1 = none.
     """
 
     texture: Tensor
     known: Tensor
+    painted: Tensor
     confidence: Tensor
     labels: Tensor
 
@@ -58,4 +60,4 @@ def select_views(given: MethodInput) -> Selection:
     )
     known = label >= 0
     texture = fill_holes(back_project(color, label, maps), known)
-    return Selection(texture, known, confidence, assignment.view)
+    return Selection(texture, known, label.to(torch.int16), confidence, assignment.view)

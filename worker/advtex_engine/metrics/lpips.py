@@ -149,6 +149,21 @@ class Lpips:
         self.stack = stack
         self.heads = [head.view(1, -1, 1, 1) for head in heads]
 
+    def to(self, device: torch.device) -> Lpips:
+        """The same on another device."""
+        return Lpips(self.stack.to(device), [head.to(device) for head in self.heads])
+
+    @torch.no_grad()
+    def maps(self, images: Tensor, truths: Tensor) -> Tensor:
+        """Pairs of images [N,3,H,W] sRGB in [0,1] -> the maps [N,H,W] of `__call__`."""
+        assert images.shape == truths.shape and images.shape[1] == 3
+        size, count = images.shape[-2:], len(images)
+        whole = images.new_zeros((count, 1, *size))
+        for features, head in zip(self.stack(torch.cat((images, truths))), self.heads, strict=True):
+            layer = _unlike(features[:count], features[count:], head)
+            whole += F.interpolate(layer, size, mode="bilinear", align_corners=False)
+        return whole[:, 0]
+
     @torch.no_grad()
     def __call__(self, image: Tensor, truth: Tensor) -> tuple[float, Tensor]:
         """Two images [H,W,3] sRGB in [0,1] -> the distance as published, and its map [H,W].
@@ -161,8 +176,7 @@ class Lpips:
         total, whole = 0.0, torch.zeros(size, device=image.device)
         pair = torch.stack((image, truth)).to(torch.float32).permute(0, 3, 1, 2)
         for features, head in zip(self.stack(pair), self.heads, strict=True):
-            unit = features / (features.square().sum(1, keepdim=True).sqrt() + 1e-10)
-            layer = ((unit[:1] - unit[1:]).square() * head).sum(1, keepdim=True)
+            layer = _unlike(features[:1], features[1:], head)
             total += float(layer.mean())
             whole += F.interpolate(layer, size, mode="bilinear", align_corners=False)[0, 0]
         return total, whole
@@ -175,6 +189,12 @@ class Lpips:
     def on_black(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
         """The distance as published with both images black outside the mask; the black part is averaged in."""
         return self(image * mask[..., None], truth * mask[..., None])[0]
+
+
+def _unlike(features: Tensor, truths: Tensor, head: Tensor) -> Tensor:
+    """[N,C,h,w] each -> [N,1,h,w]: squared differences of features of unit length, weighted by the head [1,C,1,1]."""
+    units = [each / (each.square().sum(1, keepdim=True).sqrt() + 1e-10) for each in (features, truths)]
+    return ((units[0] - units[1]).square() * head).sum(1, keepdim=True)
 
 
 def load_lpips(folder: Path | None = None) -> Lpips:

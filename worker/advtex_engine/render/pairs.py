@@ -106,6 +106,19 @@ def _blocks(maps: ViewMaps, *, with_color: bool = False) -> Iterator[tuple[int, 
         yield first, replace(block, color=maps.color[part].to(maps.device)) if with_color else block
 
 
+def without(pairs: Pairs, left_out: Tensor) -> Pairs:
+    """The pairs in which none of the views [V] bool takes part; tables keep their size, sources become fewer.
+
+    The candidates that remain keep their order. The order of a source's candidates that do not count may change.
+    """
+    columns = torch.arange(pairs.auxiliary.shape[1], device=pairs.auxiliary.device)
+    remain = (columns < pairs.count[:, None]) & ~left_out[pairs.auxiliary] & ~left_out[:, None]
+    order = (~remain).to(torch.int8).argsort(dim=1, stable=True)
+    relative = pairs.relative.gather(1, order[..., None, None].expand_as(pairs.relative))
+    sources = pairs.sources[~left_out[pairs.sources]]
+    return Pairs(pairs.auxiliary.gather(1, order), remain.sum(1), sources, relative)
+
+
 def own_pairs(maps: ViewMaps) -> Pairs:
     """Every view with itself alone: the ablation without auxiliary views (paper section 4)."""
     views = torch.arange(maps.count, device=maps.device)

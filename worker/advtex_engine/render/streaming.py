@@ -19,13 +19,14 @@ import math
 import os
 import tempfile
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-from advtex_engine.render.pairs import Pairs
+from advtex_engine.render.pairs import Pairs, without
 from advtex_engine.render.view_maps import Allocate, ViewMaps
 
 AUXILIARIES = 3
@@ -72,7 +73,9 @@ class PairViews(Protocol):
     """What a pair sampler reads, and what keeps it filled.
 
     maps, pairs: the same tensors for as long as the run lasts. advance: called once `steps` more steps have been taken.
-    state_dict: all that decides which views come next; load_state_dict goes on from there.
+    leave_out: from now on, no pair of these views [V] bool (on the CPU) is drawn, and all others are; -> how many of
+    `pairs.sources` count then. Waits for nothing but tables of views.
+    state_dict: all that decides which views come next; load_state_dict goes on from there, after the same `leave_out`.
     """
 
     @property
@@ -82,6 +85,8 @@ class PairViews(Protocol):
     def pairs(self) -> Pairs: ...
 
     def advance(self, steps: int) -> None: ...
+
+    def leave_out(self, left_out: Tensor) -> int: ...
 
     def state_dict(self) -> dict[str, int]: ...
 
@@ -95,13 +100,27 @@ def pair_views(maps: ViewMaps, pairs: Pairs, on_device: int | None, seed: int) -
 
 @dataclass(frozen=True)
 class ResidentViews:
-    """All views are on the device, and nothing moves."""
+    """All views are on the device, and nothing moves. pairs: its own, if views are to be left out."""
 
     maps: ViewMaps
     pairs: Pairs
 
     def advance(self, steps: int) -> None:
         """Nothing to do."""
+
+    def leave_out(self, left_out: Tensor) -> int:
+        """Changes the pairs in place."""
+        remain = without(self._whole, left_out.to(self._whole.sources.device))
+        number = len(remain.sources)
+        self.pairs.sources[:number] = remain.sources
+        for name in ("auxiliary", "count", "relative"):
+            getattr(self.pairs, name).copy_(getattr(remain, name))
+        return number
+
+    @cached_property
+    def _whole(self) -> Pairs:
+        """All pairs, as they are before any view is left out; runs that leave none out keep no copy."""
+        return Pairs(*(part.clone() for part in vars(self.pairs).values()))
 
     def state_dict(self) -> dict[str, int]:
         return {}
@@ -122,10 +141,10 @@ class Groups:
 class GroupOrder:
     """The endless sequence of groups: a function of the seed and the place in it, so that a run can go on anywhere.
 
-    pairs: on the CPU. Place p is place p % S of pass p // S over the S sources.
+    pairs: on the CPU. Place p is place p % S of pass p // S over the S sources. seed: a number, or any words.
     """
 
-    def __init__(self, pairs: Pairs, seed: int) -> None:
+    def __init__(self, pairs: Pairs, seed: int | str) -> None:
         self.sources, self.seed = pairs.sources, seed
         self.count = pairs.count[pairs.sources]
         self.columns = pairs.auxiliary.shape[1]
@@ -177,9 +196,10 @@ class StreamedViews:
     def __init__(self, maps: ViewMaps, pairs: Pairs, on_device: int, seed: int) -> None:
         assert on_device >= LEAST_VIEWS and len(pairs.sources) > 0
         device = maps.device
-        self._all, self._all_pairs = maps, _on_host(pairs)
+        self._all, self._all_pairs, self._seed = maps, _on_host(pairs), seed
+        self._drawn = self._all_pairs
         self._pose = (maps.intrinsics.cpu(), maps.world_to_camera.cpu())
-        self._order = GroupOrder(self._all_pairs, seed)
+        self._begin_order(0)
         self._kept = self._order.kept
         self._width = 1 + min(self._kept, self._order.columns - 1)  # a source is its own candidate, too
         self._groups = max(1, min(on_device // (2 * self._width), len(pairs.sources)))
@@ -219,15 +239,28 @@ class StreamedViews:
         if self._used >= self.block_views:
             self._change()
 
+    def leave_out(self, left_out: Tensor) -> int:
+        """Another order begins, with a block that is filled at once; the number of sources in a block stays."""
+        self._drawn = without(self._all_pairs, left_out)
+        self._begin_order(self._orders + 1)
+        self._start(0)
+        return self._groups
+
+    def _begin_order(self, number: int) -> None:
+        # Each its own: an order that is left before its end would always have shown the same sources.
+        self._orders = number
+        self._order = GroupOrder(self._drawn, self._seed if number == 0 else f"{self._seed}, order {number}")
+
     def state_dict(self) -> dict[str, int]:
-        """place: of the block's first group. used: steps taken from it. groups: in a block."""
-        return {"place": self._place, "used": self._used, "groups": self._groups}
+        """place: of the block's first group. used: steps taken from it. groups: in a block. orders: begun so far."""
+        return {"place": self._place, "used": self._used, "groups": self._groups, "orders": self._orders}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
         """Where blocks have another size, what is left of the saved one is the beginning of a new one; without a state,
         which comes from a run that had all views there, at the beginning."""
         if not state:
             return
+        self._begin_order(state["orders"])
         if state["groups"] == self._groups:
             self._start(state["place"])
             self.advance(state["used"])
@@ -258,7 +291,7 @@ class StreamedViews:
 
     def _prepare(self) -> None:
         """Which views the next block has, and everything about it but their pixels."""
-        pairs, groups = self._all_pairs, self._order.groups(self._place + self._groups, self._groups)
+        pairs, groups = self._drawn, self._order.groups(self._place + self._groups, self._groups)
         rows = groups.source[:, None]
         views = pairs.auxiliary[rows, groups.candidate]
         own = groups.candidate == 0  # the first candidate is the source itself

@@ -33,7 +33,8 @@ def method_input(
         given = replace(given, on_device=budget.limits.on_device)
         if work.plays:
             if preset.start == "selection":
-                given = replace(given, start=_selected_start(given))
+                start, painted = _selected_start(given)
+                given = replace(given, start=start, painted=painted)
             if preset.toned:
                 for level in maps.values():
                     tone_views(level, starting_texture(given))
@@ -41,12 +42,11 @@ def method_input(
     return given
 
 
-def _selected_start(given: MethodInput) -> Tensor:
-    """The texture by view selection; from the work folder when it is there."""
-    saved = given.work.load("initial_texture", ("texture",))
+def _selected_start(given: MethodInput) -> tuple[Tensor, Tensor]:
+    """The texture by view selection, and which view each texel shows; from the work folder when they are there."""
+    saved = given.work.load("initial_texture", ("texture", "painted"))
     if saved is not None:
-        texture: Tensor = saved["texture"].to(given.means[1])
-        return texture
-    texture = select_views(given).texture
-    given.work.save("initial_texture", {"texture": texture})
-    return texture
+        return saved["texture"].to(given.means[1]), saved["painted"].to(given.means[1].device)
+    selection = select_views(given)
+    given.work.save("initial_texture", {"texture": selection.texture, "painted": selection.painted})
+    return selection.texture, selection.painted

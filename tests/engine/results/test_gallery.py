@@ -213,6 +213,7 @@ def page_of(out: Path, name: str, files: tuple[Path, ...]) -> tuple[Page, str]:
         "conventions": {"summary": name},
         "surface": {"seen": 0.5, "guessed": 0.125, "unseen": 0.375},
         "losses": [1],
+        "game": {"points": [], "probes": {"told": name}},
     }
     text = write_page(out, report, files)[-1].read_text()
     page = Page()
@@ -265,6 +266,8 @@ def test_the_page_opens_from_disk_and_runs_no_name(result: tuple[Path, Scene, At
         tab.mouse.up()
         turned = tab.locator("#frame").evaluate("image => image.src")
         assert not turned.endswith(first or "none")
+        assert tab.locator("#probes").inner_text() == HOSTILE
+        assert not tab.locator("#game").is_visible()
         assert not tab.locator("#shares").is_visible()
         tab.get_by_label("Show what no photograph shows").check()
         assert (

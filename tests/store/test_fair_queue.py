@@ -245,7 +245,7 @@ def test_a_look_costs_what_it_finds_and_not_what_waits(bench: Any) -> None:
         rows = [Job("abcde"[n % 5], priority=n % 3, memory=n % 7 * GIB, batch="xyz"[n % 2]) for n in range(waiting)]
         fill(bench, bench.finished_upload(), rows)
         took = []
-        for _ in range(7):
+        for _ in range(25):  # the least of many: other processes may be at work
             began = time.perf_counter()
             assert len(bench.records.waiting(20, 5 * GIB)) == 20
             bench.records.explain("")
@@ -265,7 +265,7 @@ def test_a_look_costs_no_more_with_thousands_of_batches(sqlite_bench: Any) -> No
 
     def seconds(gaze: Gaze | None) -> float:
         took = []
-        for _ in range(5):
+        for _ in range(15):
             began = time.perf_counter()
             with bench.database.read() as session:
                 assert len(next_jobs(session, 20, bench.clock.now, 5, (), gaze)) == 20

@@ -213,10 +213,10 @@ def test_a_storage_that_fails_for_a_while_delays_the_results(
     monkeypatch.setattr("advtex_worker.patience.RETRY_SECONDS", 0.0)
     commit, troubles = Results.commit, iter([NoSpace("the disk is full"), BlobsUnavailable("no answer")])
 
-    def flaky(*arguments: Any) -> Any:
+    def flaky(*arguments: Any, **named: Any) -> Any:
         for trouble in troubles:
             raise trouble
-        return commit(*arguments)
+        return commit(*arguments, **named)
 
     monkeypatch.setattr(Results, "commit", flaky)
     job_id = new_job()
@@ -320,7 +320,7 @@ def test_a_list_of_results_that_is_damaged_ends_the_job_with_that_reason(
 def test_a_flaw_of_the_worker_itself_is_a_death_with_its_traceback(
     store: Store, host: Hosts, new_job: NewJob, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def flawed(*_arguments: Any) -> None:
+    def flawed(*_arguments: Any, **_named: Any) -> None:
         raise ZeroDivisionError("a flaw")
 
     monkeypatch.setattr(Results, "commit", flawed)

@@ -80,7 +80,7 @@ def test_a_cancel_does_not_wait_for_the_storage(
     job_id = new_job(steps=20 if slow == "commit" else 1000)
     hung, go_on = threading.Event(), threading.Event()
 
-    def hang(*_arguments: Any) -> Any:
+    def hang(*_arguments: Any, **_named: Any) -> Any:
         hung.set()
         go_on.wait(20)
         raise BlobsUnavailable("no answer")

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from game import changes
 from harness import (
     RESULTS,
     Results,
@@ -68,6 +69,7 @@ def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--preset", default="standard", choices=["standard", "full"])
     parser.add_argument("--steps", type=int, help="the preset's if not given")
     parser.add_argument("--turn", type=int, help="steps; the preset's if not given")
+    parser.add_argument("--change", nargs="*", default=[], metavar="NAME=VALUE", help="numbers of the preset")
     parser.add_argument("--no-refine", action="store_true", help="cameras as they are")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="auto")
@@ -152,7 +154,8 @@ def run(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
 
 def _settings(arguments: argparse.Namespace, scan: str, preset: Preset) -> dict[str, Any]:
     given = {"preset": arguments.preset, "steps": preset.steps, "turn": preset.turn, "seed": arguments.seed}
-    return {"scan": scan, "size": arguments.scan_size, "refined": not arguments.no_refine, **given}
+    changed = " ".join(arguments.change)
+    return {"scan": scan, "size": arguments.scan_size, "refined": not arguments.no_refine, "changes": changed, **given}
 
 
 def _input(arguments: argparse.Namespace, scan: Path, holdout: int | None, folder: Path) -> MethodInput:
@@ -169,7 +172,8 @@ def _input(arguments: argparse.Namespace, scan: Path, holdout: int | None, folde
     )
     given = prepare(scan, config, folder / "work", device)
     preset = resolve_preset(config, device.type)
-    return dataclasses.replace(given, preset=dataclasses.replace(preset, turn=arguments.turn or preset.turn))
+    preset = dataclasses.replace(preset, turn=arguments.turn or preset.turn, **changes(arguments.change))
+    return dataclasses.replace(given, preset=preset)
 
 
 def _against_truth(given: MethodInput, scan: Path, lpips: Lpips) -> Score:
@@ -218,8 +222,9 @@ def report(arguments: argparse.Namespace, results: Results) -> None:
     for cell in results.cells:
         settings = cell["settings"]
         cameras = "" if settings["refined"] else ", cameras as they are"
+        changed = f", {settings['changes']}" if settings["changes"] else ""
         title = f"{settings['scan']}, {settings['size']}, {settings['preset']}, {settings['steps']} steps in turns of"
-        runs.setdefault(f"{title} {settings['turn']}, seed {settings['seed']}{cameras}", []).append(cell)
+        runs.setdefault(f"{title} {settings['turn']}, seed {settings['seed']}{cameras}{changed}", []).append(cell)
     patience = PRESETS[arguments.preset].patience
     kept, body = [], ""
     for title, cells in runs.items():

@@ -133,7 +133,7 @@ def play(given: MethodInput, lpips: Lpips, score: Score, results: Results, setti
             looks[name] += time.monotonic() - began
         texture = fill_holes(dense_texture(maps, optimizer.result).clamp(0, 1), maps.slot_map >= 0).cpu()
         found = {f"gain_{name}": probes.turns.gain for name, probes in judges.items()}
-        found |= {f"looks_{name}": seconds / (in_steps / step) for name, seconds in looks.items()}
+        found |= {f"looks_{name}": seconds * step / in_steps for name, seconds in looks.items()}
         results.add({**settings, "step": step}, {"lpips": score(texture), **found}, watch.seconds)
 
 
@@ -216,6 +216,12 @@ def kept_state(gains: Sequence[float], patience: int) -> tuple[int, int]:
     return best, len(gains) - 1
 
 
+def patience_of(settings: dict[str, Any]) -> int:
+    """Turns of the run's length that have as many steps as the preset's patience."""
+    preset = PRESETS[settings["preset"]]
+    return max(1, round(preset.patience * preset.turn * settings["steps"] / preset.steps / settings["turn"]))
+
+
 def report(arguments: argparse.Namespace, results: Results) -> None:
     """probes.md: what is kept by each measure, and a table of states per run."""
     runs = dict[str, list[dict[str, Any]]]()
@@ -225,9 +231,9 @@ def report(arguments: argparse.Namespace, results: Results) -> None:
         changed = f", {settings['changes']}" if settings["changes"] else ""
         title = f"{settings['scan']}, {settings['size']}, {settings['preset']}, {settings['steps']} steps in turns of"
         runs.setdefault(f"{title} {settings['turn']}, seed {settings['seed']}{cameras}{changed}", []).append(cell)
-    patience = PRESETS[arguments.preset].patience
     kept, body = [], ""
     for title, cells in runs.items():
+        patience = patience_of(cells[0]["settings"])
         truth = [cell["scores"]["lpips"] for cell in cells]
         best = min(truth)
         for name in MEASURES:
@@ -258,7 +264,10 @@ def report(arguments: argparse.Namespace, results: Results) -> None:
         "looks, in steps",
     ]
     table = markdown_table(head, [[f"{cell:.4f}" if isinstance(cell, float) else cell for cell in row] for row in kept])
-    told = f"Patience of {patience} turns. Where the start is the best, step is that of its end of pretraining.\n\n"
+    told = (
+        "The patience is as many turns as have the preset's steps of it. Kept, ended and best are steps; the start is that"
+        " at the end of the pretraining.\n\n"
+    )
     write_report(arguments.results / "probes.md", "Views left out by turns", results.cells, f"{told}{table}{body}")
 
 

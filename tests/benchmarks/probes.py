@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from game import changes
 from harness import (
     RESULTS,
     Results,
@@ -68,6 +69,7 @@ def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--preset", default="standard", choices=["standard", "full"])
     parser.add_argument("--steps", type=int, help="the preset's if not given")
     parser.add_argument("--turn", type=int, help="steps; the preset's if not given")
+    parser.add_argument("--change", nargs="*", default=[], metavar="NAME=VALUE", help="numbers of the preset")
     parser.add_argument("--no-refine", action="store_true", help="cameras as they are")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="auto")
@@ -131,7 +133,7 @@ def play(given: MethodInput, lpips: Lpips, score: Score, results: Results, setti
             looks[name] += time.monotonic() - began
         texture = fill_holes(dense_texture(maps, optimizer.result).clamp(0, 1), maps.slot_map >= 0).cpu()
         found = {f"gain_{name}": probes.turns.gain for name, probes in judges.items()}
-        found |= {f"looks_{name}": seconds / (in_steps / step) for name, seconds in looks.items()}
+        found |= {f"looks_{name}": seconds * step / in_steps for name, seconds in looks.items()}
         results.add({**settings, "step": step}, {"lpips": score(texture), **found}, watch.seconds)
 
 
@@ -152,7 +154,8 @@ def run(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
 
 def _settings(arguments: argparse.Namespace, scan: str, preset: Preset) -> dict[str, Any]:
     given = {"preset": arguments.preset, "steps": preset.steps, "turn": preset.turn, "seed": arguments.seed}
-    return {"scan": scan, "size": arguments.scan_size, "refined": not arguments.no_refine, **given}
+    changed = " ".join(arguments.change)
+    return {"scan": scan, "size": arguments.scan_size, "refined": not arguments.no_refine, "changes": changed, **given}
 
 
 def _input(arguments: argparse.Namespace, scan: Path, holdout: int | None, folder: Path) -> MethodInput:
@@ -169,7 +172,8 @@ def _input(arguments: argparse.Namespace, scan: Path, holdout: int | None, folde
     )
     given = prepare(scan, config, folder / "work", device)
     preset = resolve_preset(config, device.type)
-    return dataclasses.replace(given, preset=dataclasses.replace(preset, turn=arguments.turn or preset.turn))
+    preset = dataclasses.replace(preset, turn=arguments.turn or preset.turn, **changes(arguments.change))
+    return dataclasses.replace(given, preset=preset)
 
 
 def _against_truth(given: MethodInput, scan: Path, lpips: Lpips) -> Score:
@@ -212,17 +216,24 @@ def kept_state(gains: Sequence[float], patience: int) -> tuple[int, int]:
     return best, len(gains) - 1
 
 
+def patience_of(settings: dict[str, Any]) -> int:
+    """Turns of the run's length that have as many steps as the preset's patience."""
+    preset = PRESETS[settings["preset"]]
+    return max(1, round(preset.patience * preset.turn * settings["steps"] / preset.steps / settings["turn"]))
+
+
 def report(arguments: argparse.Namespace, results: Results) -> None:
     """probes.md: what is kept by each measure, and a table of states per run."""
     runs = dict[str, list[dict[str, Any]]]()
     for cell in results.cells:
         settings = cell["settings"]
         cameras = "" if settings["refined"] else ", cameras as they are"
+        changed = f", {settings['changes']}" if settings["changes"] else ""
         title = f"{settings['scan']}, {settings['size']}, {settings['preset']}, {settings['steps']} steps in turns of"
-        runs.setdefault(f"{title} {settings['turn']}, seed {settings['seed']}{cameras}", []).append(cell)
-    patience = PRESETS[arguments.preset].patience
+        runs.setdefault(f"{title} {settings['turn']}, seed {settings['seed']}{cameras}{changed}", []).append(cell)
     kept, body = [], ""
     for title, cells in runs.items():
+        patience = patience_of(cells[0]["settings"])
         truth = [cell["scores"]["lpips"] for cell in cells]
         best = min(truth)
         for name in MEASURES:
@@ -253,7 +264,10 @@ def report(arguments: argparse.Namespace, results: Results) -> None:
         "looks, in steps",
     ]
     table = markdown_table(head, [[f"{cell:.4f}" if isinstance(cell, float) else cell for cell in row] for row in kept])
-    told = f"Patience of {patience} turns. Where the start is the best, step is that of its end of pretraining.\n\n"
+    told = (
+        "The patience is as many turns as have the preset's steps of it. Kept, ended and best are steps; the start is that"
+        " at the end of the pretraining.\n\n"
+    )
     write_report(arguments.results / "probes.md", "Views left out by turns", results.cells, f"{told}{table}{body}")
 
 

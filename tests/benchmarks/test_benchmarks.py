@@ -12,6 +12,7 @@ import game
 import harness
 import paper
 import parts
+import probes
 import pytest
 import real_errors
 import scans
@@ -276,6 +277,35 @@ def test_the_game_ends_where_the_run_ends(tmp_path: Path, weights: Path, monkeyp
     assert "## desk, 96x64, paper, 4 steps, start=selection lr_texture=1e-2" in page
     with pytest.raises(SystemExit, match="--change rate: the preset has no such number"):
         game.main([*line, "--change", "rate=1", "--results", str(tmp_path / "game")])
+
+
+def test_the_state_that_is_kept_is_the_best_before_patience_is_over() -> None:
+    assert probes.kept_state([0, 1, 3, 2, 4], 2) == (4, 4)
+    assert probes.kept_state([0, 1, 3, 2, 1, 9], 2) == (2, 4)
+    assert probes.kept_state([0, -1, -2, 9], 2) == (0, 2)
+    assert probes.rank_correlation([1, 2, 3, 4], [10, 20, 50, 90]) == pytest.approx(1)
+    assert probes.rank_correlation([1, 2, 2, 4], [8, 6, 6, 1]) == pytest.approx(-1)
+    assert probes.ranks([5, 1, 5, 9]) == [2.5, 1, 2.5, 4]
+    settings = {"preset": "standard", "steps": 1500}
+    assert [probes.patience_of({**settings, "turn": turn}) for turn in (40, 60, 120, 500)] == [3, 2, 1, 1]
+
+
+@pytest.mark.slow
+def test_probes_stand_beside_views_that_a_run_never_sees(tmp_path: Path, weights: Path) -> None:
+    synthesize(tmp_path / "desk", views=18, width=96, height=64)
+    line = [str(tmp_path / "desk"), "--synthetic", "geometry", "--views", "8", "--scan-size", "96x64", "--faces", "600"]
+    line += ["--steps", "8", "--turn", "3", "--no-refine", "--device", "cpu"]
+    probes.main([*line, "--lpips-weights", str(weights), "--results", str(tmp_path / "out")])
+    cells = json.loads((tmp_path / "out" / "probes.json").read_text())["cells"]
+    assert [(cell["settings"]["scan"], cell["settings"]["step"]) for cell in cells] == [
+        (scan, step) for scan in ("geometry", "desk") for step in (0, 3, 6, 8)
+    ]
+    for cell in cells:
+        gains = [cell["scores"][f"gain_{name}"] for name in probes.MEASURES]
+        assert (gains == [0, 0]) == (cell["settings"]["step"] == 0)
+        assert cell["scores"]["lpips"] > 0
+    page = (tmp_path / "out" / "probes.md").read_text()
+    assert "## desk, 96x64, standard, 8 steps in turns of 3, seed 0, cameras as they are" in page
 
 
 @pytest.mark.slow

@@ -212,3 +212,14 @@ def test_progress_tells_the_share_of_late_beside_the_losses() -> None:
     points = [{**losses, **point} for point in told(0.5, 0.6)]
     assert _shown(points, 1500) == {**losses, "accuracy": pytest.approx(0.6)}
     assert _shown([{"step": 1, **losses}], 1500) == losses
+
+
+def test_steps_that_a_level_ended_without_count_for_nothing() -> None:
+    """The lower of two levels ends after step 40 of 60: the point at step 65 tells of five steps, and not of 25."""
+    known = {"accuracy_real": 0.6, "accuracy_fake": 0.6, "margin": 0.1, "spread": 1.0, "skipped": 0.0}
+    points = [{"step": step, "accuracy": 0.9 if step > 60 else 0.6, **known} for step in (20, 40, 65)]
+    levels = (PyramidLevel(60, scale=2), PyramidLevel(40))
+    (part,) = stretches(points[2:], 0, 100, levels)
+    assert (part.first, part.last) == (60, 65)
+    taken = [part.last - part.first for part in stretches(points, 0, 100, levels)]
+    assert sum(taken) == 45

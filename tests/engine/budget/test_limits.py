@@ -98,7 +98,7 @@ def test_what_the_device_holds_of_it_already_counts_as_free(tmp_path: Path, monk
 
 def test_then_the_crop_then_the_texture_and_then_it_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     small = replace(WORK, preset=replace(WORK.preset, max_crop=(192, 144)))
-    has(monkeypatch, int(needed(small, LEAST_VIEWS) / 0.89))
+    has(monkeypatch, int(needed(small, LEAST_VIEWS) / 0.895))
     given = budget(tmp_path)
     assert not given.fit(WORK, "atlas")
     assert given.limits == Limits(on_device=LEAST_VIEWS, max_crop=(192, 144))

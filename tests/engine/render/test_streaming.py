@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -212,6 +213,88 @@ def test_a_smaller_block_goes_on_with_the_sources_that_are_left() -> None:
     places = 4 + 5 // 4  # groups used up
     expected = GroupOrder(all_pairs, 1).groups(places, 2).source
     assert streamed_sources(smaller) == expected.tolist()
+
+
+def without_by_hand(left_out: list[int]) -> dict[tuple[int, int], Fraction]:
+    """The probability of each pair where some views take no part."""
+    sources = [source for source in SOURCES if source not in left_out]
+    remain = {source: [view for view in CANDIDATES[source] if view not in left_out] for source in sources}
+    return {
+        (source, view): Fraction(1, len(sources) * len(remain[source])) for source in sources for view in remain[source]
+    }
+
+
+def mask(left_out: list[int]) -> Tensor:
+    return torch.zeros(len(CANDIDATES), dtype=torch.bool).index_fill(0, torch.tensor(left_out, dtype=torch.int64), True)
+
+
+@pytest.mark.parametrize("left_out", [[0], [1, 4], [0, 3], [5], [2], []])
+def test_views_that_are_left_out_are_in_no_pair_and_all_others_are_drawn_alike(left_out: list[int]) -> None:
+    """In place, and not for good: the tables that a captured step reads are the same ones, and come back whole."""
+    everything = ResidentViews(views(), pairs())
+    tables = [part.data_ptr() for part in vars(everything.pairs).values()]
+    before = [part.clone() for part in vars(everything.pairs).values()]
+    held = torch.arange(len(CANDIDATES))
+    for now in ([4, 5], left_out):
+        number = everything.leave_out(mask(now))
+        there = replace(everything.pairs, sources=everything.pairs.sources[:number])
+        assert drawn_from(there, held) == without_by_hand(now)
+        for source in there.sources.tolist():
+            poses = there.relative[source, : int(there.count[source]), 0, :2].tolist()
+            assert poses == [[source, view] for view in there.auxiliary[source, : int(there.count[source])].tolist()]
+    assert everything.leave_out(mask([])) == len(SOURCES)
+    assert tables == [part.data_ptr() for part in vars(everything.pairs).values()]
+    rows = torch.arange(before[0].shape[1]) < before[1][:, None]
+    assert torch.equal(everything.pairs.auxiliary[rows], before[0][rows])
+    assert torch.equal(everything.pairs.count, before[1])
+    assert torch.equal(everything.pairs.sources, before[2])
+
+
+@pytest.mark.parametrize("left_out", [[0], [1, 4], [0, 3]])
+def test_streamed_views_leave_out_the_same(left_out: list[int]) -> None:
+    """Also when it is said in the middle of a block; with no view that is left out on the device."""
+    streamed, seen = StreamedViews(views(), pairs(), 16, 3), dict[tuple[int, int], Fraction]()
+    tables = [part.data_ptr() for part in vars(streamed.pairs).values()]
+    streamed.advance(3)
+    assert streamed.leave_out(mask(left_out)) == len(streamed.pairs.sources)
+    for _ in range(80):
+        seen |= drawn_from(streamed.pairs, streamed.held)
+        streamed.advance(1)
+        assert not set(streamed.held.tolist()) & set(left_out)
+    assert set(seen) == set(without_by_hand(left_out))
+    assert tables == [part.data_ptr() for part in vars(streamed.pairs).values()]
+    streamed.leave_out(mask([]))
+    seen.clear()
+    for _ in range(120):
+        seen |= drawn_from(streamed.pairs, streamed.held)
+        streamed.advance(1)
+    assert set(seen) == set(drawable())
+
+
+def test_turns_that_are_shorter_than_a_pass_show_all_sources_alike() -> None:
+    streamed, drawn = StreamedViews(views(), pairs(), LEAST_VIEWS, 3), Counter[int]()
+    for _ in range(300):
+        streamed.leave_out(mask([2]))
+        drawn.update(streamed_sources(streamed))
+    assert sum(drawn.values()) == 300
+    assert min(drawn[source] for source in SOURCES) > 300 / len(SOURCES) - 4 * (300 * 0.2 * 0.8) ** 0.5
+
+
+@pytest.mark.parametrize("stop", [0, 5, 25])
+def test_a_turn_that_goes_on_draws_the_same(stop: int) -> None:
+    maps, all_pairs = views(), pairs()
+    generator = torch.Generator().manual_seed(0)
+    streamed = StreamedViews(maps, all_pairs, 16, 1)
+    for now in ([0], [1, 3]):
+        streamed.leave_out(mask(now))
+    draws(streamed, generator, stop, 1)
+    state, random = streamed.state_dict(), generator.get_state()
+    whole = draws(streamed, generator, 30, 1)
+    again = StreamedViews(maps, all_pairs, 16, 1)
+    again.leave_out(mask([1, 3]))
+    again.load_state_dict(state)
+    generator.set_state(random)
+    assert all(torch.equal(*both) for both in zip(whole, draws(again, generator, 30, 1), strict=True))
 
 
 def streamed_sources(streamed: StreamedViews) -> list[int]:

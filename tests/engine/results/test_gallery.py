@@ -198,6 +198,9 @@ class Page(HTMLParser):
             self.data, self.inside = json.loads(data), False
 
 
+TOLD = "The game ended after step 270 of 1500, judged by views: never better than its start."
+
+
 def page_of(out: Path, name: str, files: tuple[Path, ...]) -> tuple[Page, str]:
     stage = {"stage": name, "seconds": 1.5, "peak_memory_bytes": 1 << 20, "peak_device_memory_bytes": None}
     scan = {"views": 16, "width": 96, "height": 72, "faces": 12, "heldout": [name], "notes": [name]}
@@ -213,7 +216,7 @@ def page_of(out: Path, name: str, files: tuple[Path, ...]) -> tuple[Page, str]:
         "conventions": {"summary": name},
         "surface": {"seen": 0.5, "guessed": 0.125, "unseen": 0.375},
         "losses": [1],
-        "game": {"points": [], "probes": {"told": name}},
+        "game": {"points": [], "probes": {"told": TOLD}},
     }
     text = write_page(out, report, files)[-1].read_text()
     page = Page()
@@ -232,6 +235,7 @@ def test_a_hostile_name_stays_a_name_on_the_page(result: tuple[Path, Scene, Atla
     assert HOSTILE in [view["name"] for view in page.data["manifest"]["views"]]
     assert page.data["files"] == ["model.glb"]
     assert HOSTILE not in text
+    assert page.data["probes"] == TOLD
     assert not re.search(r"innerHTML|outerHTML|document\.write|insertAdjacent|eval\(|fetch\(", text)
     assert re.findall(r"https?://[^\"]*", text) == ["http://www.w3.org/2000/svg"], "nothing comes from the network"
 
@@ -266,8 +270,7 @@ def test_the_page_opens_from_disk_and_runs_no_name(result: tuple[Path, Scene, At
         tab.mouse.up()
         turned = tab.locator("#frame").evaluate("image => image.src")
         assert not turned.endswith(first or "none")
-        assert tab.locator("#probes").inner_text() == HOSTILE
-        assert not tab.locator("#game").is_visible()
+        assert tab.locator("#probes").inner_text() == TOLD
         assert not tab.locator("#shares").is_visible()
         tab.get_by_label("Show what no photograph shows").check()
         assert (

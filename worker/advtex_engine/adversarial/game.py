@@ -15,9 +15,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
-from advtex_engine.core.config import Preset
+from advtex_engine.core.config import Preset, PyramidLevel
 from advtex_engine.core.errors import Problem
 
 KNOWLEDGE_NAMES = ("accuracy", "accuracy_real", "accuracy_fake", "margin", "spread")
@@ -71,16 +72,23 @@ class Stretch:
         return {"at": place, "step": self.last} | {name: self.means[name] for name in KNOWLEDGE_NAMES}
 
 
-def stretches(points: Sequence[Point], pretraining: int, steps: int) -> list[Stretch]:
+def stretches(
+    points: Sequence[Point], pretraining: int, steps: int, levels: Sequence[PyramidLevel] = ()
+) -> list[Stretch]:
     """Means of the history over equal stretches after the pretraining, and over its last one.
 
-    What the discriminator does not know before is no fault. Stretches in which nothing was judged are left out.
+    What the discriminator does not know before is no fault. Stretches in which nothing was judged are left out, and so
+    are the steps that a level of a pyramid ended without.
     """
+    starts = accumulate(level.steps for level in levels)
     after = max(1, steps - pretraining)
     size = after / max(1, round(after / (SHARE * steps)))
     found = dict[int, list[tuple[int, Point]]]()
     before = 0
+    start = next(starts, steps)
     for point in points:
+        while point["step"] > start:
+            before, start = start, next(starts, point["step"])
         number = math.ceil((point["step"] - pretraining) / size)
         if number >= 0 and "accuracy" in point:
             found.setdefault(number, []).append((before, point))
@@ -110,7 +118,7 @@ def summary(points: Sequence[Point], preset: Preset) -> dict[str, Any]:
     at_chance, certain: shares of the steps after its pretraining.
     """
     steps, pretraining = preset.steps, preset.pretraining
-    parts = stretches(points, pretraining, steps)
+    parts = stretches(points, pretraining, steps, preset.levels)
     played = [part for part in parts if part.last > pretraining]
     shown = [part.described("end of pretraining") for part in parts if part.last <= pretraining]
     if played:
@@ -129,7 +137,7 @@ def problems(points: Sequence[Point], preset: Preset) -> list[Problem]:
     counts. Nothing of runs below MIN_STEPS."""
     if preset.steps < MIN_STEPS:
         return []
-    parts = stretches(points, preset.pretraining, preset.steps)
+    parts = stretches(points, preset.pretraining, preset.steps, preset.levels)
     chance, certain = ([part for part in parts if getattr(part, name)] for name in ("at_chance", "certain"))
     found = []
     if chance:

@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass
 
 from advtex_engine.adversarial.optimizer import crop_size
+from advtex_engine.adversarial.probes import CELL, CELLS
 from advtex_engine.core.config import Preset
 from advtex_engine.render.view_maps import BYTES_PER_PIXEL
 from advtex_engine.runtime.available_memory import CONTEXT
@@ -20,8 +21,11 @@ from advtex_options.methods import known_methods
 FLOAT = 4
 TEXEL = 3 * FLOAT  # of a texture, three channels
 SLOT = 4  # of a slot map
+LABEL = 2  # of a texel's view
 LAYERS = ((64, 2), (128, 2), (128, 2), (128, 1), (1, 1))  # channels and strides of the discriminator
 PARAMETERS = 664_001
+PROBES = CELLS * CELL**2 * 45  # photographs, footprints and masks of the views that are left out
+PROBES_LPIPS = 10 << 20  # AlexNet's convolutions
 SCHEDULED = 5 * FLOAT  # per step of the run, its row of the schedule
 # On a GPU, from torch's allocator: cuBLAS keeps 32 MiB on Hopper and 8 on others (torch's defaults); what cuDNN and
 # cuFFT ask for comes and goes. Not measured yet.
@@ -88,6 +92,7 @@ def estimate(work: Workload, on_device: int | None = None) -> dict[str, int]:
         "slot_maps": int(texels * SLOT * shares),
         "dense_textures": int(texels * TEXEL * (shares + starts)),
         **step,
+        "probes": _probes(work),
         # Before and after the steps: what a step needs is not there then, apart from the texture's own state.
         "filling": max(0, filling - step["activations"] - step["step"]),
     }
@@ -116,6 +121,13 @@ def activations(width: int, height: int, size: int) -> list[int]:
         width, height = (width - 2) // stride + 1, (height - 2) // stride + 1
         kept.append(channels * width * height * size * (2 if number < len(LAYERS) - 1 else 1))
     return kept
+
+
+def _probes(work: Workload) -> int:
+    """What is kept between two looks: the best state, which view painted each texel, and what the next look needs."""
+    if not (work.plays and work.preset.turn):
+        return 0
+    return TEXEL * work.slots + LABEL * math.prod(work.texture) + PROBES + PROBES_LPIPS
 
 
 def _step(work: Workload) -> dict[str, int]:

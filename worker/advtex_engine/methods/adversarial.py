@@ -173,7 +173,7 @@ def _probes(
         pairs.sources.tolist(),
         leave_out,
         judged_by="structure" if lpips is None else "LPIPS",
-        start=optimizer.values.detach().clone(),
+        start=optimizer.values.detach().clone() if optimizer.start is None else optimizer.start,
         first=max(preset.pretraining, optimizer.index),
         end=end,
         turn=preset.turn,

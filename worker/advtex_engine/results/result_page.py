@@ -23,14 +23,14 @@ def write_page(out: Path, report: Mapping[str, Any], files: Sequence[Path]) -> t
 
     files: the result's; those at its root are linked. -> the paths, that of the page last.
     """
-    previews, viewer = out / "previews", write_viewer(out)
     game = report.get("game") or {}
+    previews, viewer = out / "previews", write_viewer(out)
     data = {
         "manifest": json.loads((previews / "manifest.json").read_bytes()),
         "curves": json.loads((previews / "curves.json").read_bytes()),
         "report": {name: part for name, part in report.items() if name not in LEFT_OUT},
         "game": game.get("points", []),
-        "probes": (game.get("probes") or {}).get("told"),
+        "probes": (game.get("probes") or {}).get("told", ""),
         "files": [file.name for file in files if file.parent == out],
         "viewer": {file.name: file.stat().st_size for file in viewer},
     }

@@ -265,8 +265,8 @@ def report(arguments: argparse.Namespace, results: Results) -> None:
     ]
     table = markdown_table(head, [[f"{cell:.4f}" if isinstance(cell, float) else cell for cell in row] for row in kept])
     told = (
-        "The patience is as many turns as have the preset's steps of it. Kept, ended and best are steps; the start is that"
-        " at the end of the pretraining.\n\n"
+        "The patience is as many turns as have the preset's steps of it. Kept, ended and best are steps; the start is"
+        " that at the end of the pretraining.\n\n"
     )
     write_report(arguments.results / "probes.md", "Views left out by turns", results.cells, f"{told}{table}{body}")
 

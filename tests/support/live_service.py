@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from redis import Redis
@@ -45,9 +45,12 @@ def process_tree(pid: int) -> list[int]:
     """The process and its descendants, parents first; empty if it is gone."""
     try:
         tasks = list(Path(f"/proc/{pid}/task").iterdir())
-        children = [int(child) for task in tasks for child in (task / "children").read_text().split()]
     except OSError:
         return []
+    children: list[int] = []
+    for task in tasks:
+        with suppress(OSError):  # a thread that has ended since: its process may go on
+            children += map(int, (task / "children").read_text().split())
     return [pid, *(found for child in children for found in process_tree(child))]
 
 
@@ -106,7 +109,8 @@ class LiveService:
         self.store.close()
         for process in reversed(self._processes):
             for pid in reversed(process_tree(process.pid)):
-                os.kill(pid, signal.SIGKILL)
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
             process.wait()
             if process.stdout:
                 process.stdout.close()

@@ -69,6 +69,7 @@ TABLE = {
     "gradient_adversarial": "gradient, adversarial",
     "gradient_l1": "gradient, L1",
     "gradient_features": "gradient, features",
+    "gradient_gabor": "gradient, Gabor energies",
     "discriminator": "discriminator's loss",
     "adversarial": "texture's loss",
     "l1": "L1",
@@ -84,7 +85,7 @@ TABLE = {
 PANELS = {
     "share told apart": ("accuracy", "accuracy_real", "accuracy_fake"),
     "logits": ("margin", "spread"),
-    "norm of the texture's gradient": ("gradient_adversarial", "gradient_l1", "gradient_features"),
+    "norm of the texture's gradient": ("gradient_adversarial", "gradient_l1", "gradient_features", "gradient_gabor"),
     "LPIPS of held-out views": ("lpips", "lpips_corrected"),
     "displacement, pixels": ("displacement_pixels",),
     "energy where flat, gradient ratio": ("flat_energy", "gradient_ratio"),

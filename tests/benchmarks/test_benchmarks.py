@@ -10,6 +10,7 @@ import compiled
 import discriminator
 import game
 import harness
+import losses
 import paper
 import parts
 import probes
@@ -306,6 +307,21 @@ def test_probes_stand_beside_views_that_a_run_never_sees(tmp_path: Path, weights
         assert cell["scores"]["lpips"] > 0
     page = (tmp_path / "out" / "probes.md").read_text()
     assert "## desk, 96x64, standard, 8 steps in turns of 3, seed 0, cameras as they are" in page
+
+
+def test_losses_are_compared_one_by_one(tmp_path: Path, weights: Path) -> None:
+    before = dict(vars(losses.gabor))
+    synthesize(tmp_path / "desk", views=18, width=96, height=64)
+    line = [str(tmp_path / "desk"), "--scan-size", "96x64", "--faces", "600", "--steps", "4", "--device", "cpu"]
+    line += ["--no-refine"]
+    names = ["start", "l1", "ssim", "untrained discriminator", "gabor", "no maximum", "4 orientations"]
+    for _ in range(2):  # the second time nothing is missing
+        losses.main([*line, "--losses", *names, "--lpips-weights", str(weights), "--results", str(tmp_path / "out")])
+    cells = json.loads((tmp_path / "out" / "losses.json").read_text())["cells"]
+    assert [cell["settings"]["loss"] for cell in cells] == names
+    assert len({cell["scores"]["lpips"] for cell in cells}) == len(names), "each is a loss of its own"
+    assert vars(losses.gabor) == before
+    assert "## desk, 96x64, 4 steps, cameras as they are" in (tmp_path / "out" / "losses.md").read_text()
 
 
 @pytest.mark.slow

@@ -7,7 +7,8 @@ const TITLES = {
   gradient_ratio: "Gradient ratio", accuracy: "Patches told apart (share)", accuracy_real: "Real patches told (share)",
   accuracy_fake: "Fake patches told (share)",
   margin: "Margin (real − fake logits)", spread: "Spread of the logits", gradient_adversarial: "Gradient, adversarial",
-  gradient_l1: "Gradient, L1", gradient_features: "Gradient, features",
+  gradient_l1: "Gradient, L1", gradient_features: "Gradient, features", gradient_gabor: "Gradient, Gabor energies",
+  gabor: "Gabor energies, distance",
 };
 // Drawn whole: noise about one half must not look like a curve.
 const WHOLE = { accuracy: [0, 1], accuracy_real: [0, 1], accuracy_fake: [0, 1] };

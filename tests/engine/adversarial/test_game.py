@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from advtex_engine.adversarial.discriminator import PatchDiscriminator
-from advtex_engine.adversarial.game import knowledge, problems, recent_accuracy, stretches, summary
+from advtex_engine.adversarial.game import GRADIENT_NAMES, knowledge, problems, recent_accuracy, stretches, summary
 from advtex_engine.adversarial.losses import told_apart
 from advtex_engine.adversarial.optimizer import AdversarialOptimizer
 from advtex_engine.core.config import PRESETS, PRINTED, Preset, PyramidLevel
@@ -94,7 +94,7 @@ def test_reading_out_changes_nothing() -> None:
         silent.step()
         read.step()
         if step % 4 == 0:
-            assert read.gradient_norms().keys() == {"gradient_adversarial", "gradient_l1", "gradient_features"}
+            assert set(read.gradient_norms()) == set(GRADIENT_NAMES)
             read.drain_losses()
     for a, b in zip([silent.values, *silent.parameters], [read.values, *read.parameters], strict=True):
         assert torch.equal(a, b)
@@ -103,9 +103,9 @@ def test_reading_out_changes_nothing() -> None:
 
 
 def test_the_terms_gradients_are_those_that_the_texture_gets() -> None:
-    """One by one: without the two other terms, the texture's whole gradient is the one that is left."""
-    names = {"l1_weight": "gradient_l1", "feature_weight": "gradient_features"}
-    preset = dataclasses.replace(PRESET, l1_target="source", l1_weight=3.0)
+    """One by one: without the other terms, the texture's whole gradient is the one that is left."""
+    names = {"l1_weight": "gradient_l1", "feature_weight": "gradient_features", "gabor_weight": "gradient_gabor"}
+    preset = dataclasses.replace(PRESET, l1_target="source", l1_weight=3.0, gabor_weight=2.0)
     told = optimizer(preset=preset).gradient_norms()
     for kept in (*names, None):
         changed = dataclasses.replace(preset, **{name: 0.0 for name in names if name != kept})
@@ -208,7 +208,7 @@ def test_runs_of_a_few_steps_are_not_judged() -> None:
 
 
 def test_progress_tells_the_share_of_late_beside_the_losses() -> None:
-    losses = {"discriminator": 1.3, "adversarial": 0.7, "l1": 0.1, "features": 0.0, "skipped": 0.25}
+    losses = {"discriminator": 1.3, "adversarial": 0.7, "l1": 0.1, "features": 0.0, "gabor": 0.0, "skipped": 0.25}
     points = [{**losses, **point} for point in told(0.5, 0.6)]
     assert _shown(points, 1500) == {**losses, "accuracy": pytest.approx(0.6)}
     assert _shown([{"step": 1, **losses}], 1500) == losses

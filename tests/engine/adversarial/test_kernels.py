@@ -22,6 +22,7 @@ from advtex_engine.adversarial.alignment import BLOCK
 from advtex_engine.adversarial.backend import choose_operations
 from advtex_engine.adversarial.discriminator import PatchDiscriminator
 from advtex_engine.adversarial.examples import InputForm
+from advtex_engine.adversarial.gabor import gabor_filters, gabor_loss
 from advtex_engine.adversarial.operations import plain_operations
 from advtex_engine.adversarial.optimizer import AdversarialOptimizer
 from advtex_engine.adversarial.pair_sampler import PairSampler
@@ -35,6 +36,7 @@ pytest.importorskip("triton")
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from triton.runtime.interpreter import GridExecutor
 
+fused_gabor: Any = importlib.import_module("advtex_engine.adversarial.triton_gabor")
 fused_losses: Any = importlib.import_module("advtex_engine.adversarial.triton_losses")
 fused_offsets: Any = importlib.import_module("advtex_engine.adversarial.triton_offsets")
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -47,6 +49,7 @@ def fused() -> ModuleType:
         # The interpreter's time is one per program: two programs for an image of these tests.
         module.BLOCK, module.LONG_BLOCK = 2048, 1 << 17  # type: ignore[attr-defined]
         fused_losses.BLOCK, fused_losses.LONG_BLOCK, fused_offsets.BLOCK = 4096, 1 << 17, 4096
+        fused_gabor.BLOCK, fused_gabor.LONG_BLOCK, fused_gabor.WINDOW_BLOCK = 8192, 8192, 256
     return module
 
 
@@ -254,6 +257,64 @@ def test_the_l1_loss_is_torchs(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.testing.assert_close(ours.grad, plain.grad)
 
 
+@pytest.mark.parametrize(
+    ("size", "channels_last"),
+    [((52, 55), True), ((54, 53), False), ((30, 41), True), ((26, 25), False), ((13, 90), True)],
+    ids=["3 octaves", "3 octaves, contiguous", "2 octaves", "1 octave, contiguous", "1 row of windows"],
+)
+def test_the_gabor_loss_is_torchs(monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], channels_last: bool) -> None:
+    monkeypatch.setattr(fused_gabor, "BLOCK", 2048)  # two programs, one of which has pixels of several octaves
+    monkeypatch.setattr(fused_gabor, "LONG_BLOCK", 2048)
+    monkeypatch.setattr(fused_gabor, "WINDOW_BLOCK", 128)
+    monkeypatch.setattr(fused_gabor, "ALONE", 1)
+    layout = torch.channels_last if channels_last else torch.contiguous_format
+    render, photograph = (image(3, *size, number).contiguous(memory_format=layout) for number in range(2))
+    foreground = (image(1, *size, 2) > -0.5).float()
+    foreground[..., size[1] * 3 // 4 :] = 0
+    check_gabor(render, photograph, foreground, gabor_filters(DEVICE))
+
+
+def check_gabor(render: Tensor, photograph: Tensor, foreground: Tensor, filters: Tensor) -> None:
+    ours, plain = render.clone().requires_grad_(), render.clone().requires_grad_()
+    first = fused_gabor.gabor_loss(ours, photograph, foreground, filters)
+    second = gabor_loss(plain, photograph, foreground, filters)
+    assert float(second.detach()) > 0.01
+    torch.testing.assert_close(first, second, atol=0, rtol=1e-5)
+    (3 * first).backward()
+    (3 * second).backward()
+    assert ours.grad is not None and plain.grad is not None
+    most = float(plain.grad.abs().max())
+    assert most > 1e-3
+    assert bool((ours.grad[(foreground == 0).expand_as(ours)] == 0).all())
+    torch.testing.assert_close(ours.grad, plain.grad, atol=1e-5 * most, rtol=1e-4)
+
+
+@pytest.mark.usefixtures("fused")
+def test_of_equal_energies_the_first_has_the_gradient() -> None:
+    """Rows are the same and columns repeat: a window has its greatest energy many times, exactly where a filter has but
+    one pixel, as a sum of several is rounded in some order."""
+    taps = torch.eye(49)[torch.randperm(49, generator=torch.Generator().manual_seed(0))]
+    filters = taps[: len(gabor_filters(DEVICE))].reshape(-1, 1, 7, 7).to(DEVICE)
+    render = image(3, 1, 4, 7).repeat(1, 1, 30, 8)
+    check_gabor(render, image(3, 30, 32, 8), torch.ones_like(render[:, :1]), filters)
+
+
+@pytest.mark.usefixtures("fused")
+def test_a_flat_render_has_a_finite_gabor_gradient() -> None:
+    flat = torch.full((1, 3, 30, 30), 0.3, device=DEVICE, requires_grad=True)
+    photograph, foreground = image(3, 30, 30, 1), torch.ones((1, 1, 30, 30), device=DEVICE)
+    loss = fused_gabor.gabor_loss(flat, photograph, foreground, gabor_filters(DEVICE))
+    torch.testing.assert_close(loss, gabor_loss(flat, photograph, foreground, gabor_filters(DEVICE)))
+    (gradient,) = torch.autograd.grad(loss, flat)
+    assert bool(gradient.isfinite().all())
+
+
+def test_images_smaller_than_a_window_have_no_gabor_loss() -> None:
+    small = image(3, 12, 50, 0).requires_grad_()
+    loss = fused_gabor.gabor_loss(small, image(3, 12, 50, 1), torch.ones_like(small[:, :1]), gabor_filters(DEVICE))
+    assert float(loss) == 0 and not loss.requires_grad
+
+
 def test_the_average_moves_by_its_weight(fused: ModuleType) -> None:
     mean, state = (torch.rand((3000, 3), generator=torch.Generator().manual_seed(n)).to(DEVICE) for n in range(2))
     for weight in (0.0, 0.25, 1.0):
@@ -371,7 +432,7 @@ COMPILE = """
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from advtex_engine.adversarial import kernels, kernels_losses, kernels_offsets
+from advtex_engine.adversarial import kernels, kernels_gabor, kernels_losses, kernels_offsets
 
 TYPES = {
     "choose": "fp32 i64 i64 i64 i64 i64",
@@ -388,6 +449,11 @@ TYPES = {
     "difference": "bf16 bf16 fp32",
     "difference_mean": "fp32 fp32",
     "difference_backward": "bf16 bf16 fp32 bf16",
+    "octaves": "fp32 fp32 fp32 fp32",
+    "energies": "fp32 fp32 fp32",
+    "distances": "fp32 fp32 fp32 fp32 fp32 i32",
+    "energies_backward": "fp32 fp32 i32 fp32",
+    "octaves_backward": "fp32 fp32 fp32 fp32",
     "average": "fp32 fp32 fp32",
     "luminance": "fp32 fp32 fp32 fp32 fp32",
     "cut_blocks": "fp32 fp32 fp32 fp32 fp32",
@@ -398,7 +464,7 @@ SIZES = dict(
     COLUMNS=12, ROWS=12, FREE_X=65, FREE_Y=65, WIDTH=640, HEIGHT=480, CROP=576, PIXELS=576 * 416, TEXTURE_WIDTH=2048,
     TEXTURE_HEIGHT=2048, CHANNELS=8, CONDITIONED=True, MOVED=True, WITH_MOVED=True, COUNT=10**6, BLOCK=256,
     JUDGED=True, DRAWN=True, PARTS=1000, SIDE=64, VALUES=10**6, BOUND=5, MIN_SEEN=0.6, MIN_CORRELATION=0.25,
-    MIN_GAIN=1.15,
+    MIN_GAIN=1.15, OCTAVES=3, WINDOWS=10**4,
 )
 # Not moved is how the published method's step runs; without a condition, its ablation; fp32, cards without bf16.
 OTHERS = {"assemble": ("MOVED", "CONDITIONED"), "assemble_backward": ("MOVED", "WITH_MOVED")}
@@ -407,8 +473,9 @@ variants = [(name, types, {}) for name, types in TYPES.items()]
 variants += [
     (name, TYPES[name].replace("bf16", "fp32"), {one: False}) for name, flags in OTHERS.items() for one in flags
 ]
+modules = (kernels, kernels_gabor, kernels_losses, kernels_offsets)
 for name, types, off in variants:
-    kernel = next(vars(module)[name] for module in (kernels, kernels_losses, kernels_offsets) if name in vars(module))
+    kernel = next(vars(module)[name] for module in modules if name in vars(module))
     signature = dict(zip(kernel.arg_names, ["*" + kind for kind in types.split()]))
     if name == "draw":
         signature["tolerance"] = "fp32"
@@ -432,14 +499,14 @@ def test_the_kernels_compile_for_gpus_that_are_not_here(tmp_path: Path, capabili
         [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=300, env=environment
     )
     assert done.returncode == 0, done.stderr
-    assert len(done.stdout.splitlines()) == 25
+    assert len(done.stdout.splitlines()) == 30
 
 
 def test_every_kernel_describes_its_parameters(fused: ModuleType) -> None:
     """What is launched names each pointer and number that it is given in its docstring; constants may speak for
     themselves."""
     described = 0
-    for module in (fused.kernels, fused_losses.kernels, fused_offsets.kernels):
+    for module in (fused.kernels, fused_gabor.kernels, fused_losses.kernels, fused_offsets.kernels):
         tree = ast.parse(Path(module.__file__).read_text(encoding="utf-8"))
         for function in (node for node in tree.body if isinstance(node, ast.FunctionDef)):
             if not any(isinstance(node, ast.Attribute) and node.attr == "store" for node in ast.walk(function)):
@@ -449,4 +516,4 @@ def test_every_kernel_describes_its_parameters(fused: ModuleType) -> None:
             words = set(re.findall(r"\w+", text.partition("\n\n")[2]))
             assert set(given) <= words, f"{function.name}: {sorted(set(given) - words)}"
             described += len(given)
-    assert described > 80
+    assert described > 100

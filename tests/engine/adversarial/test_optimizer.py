@@ -11,6 +11,7 @@ import torch
 
 from advtex_engine.adversarial.discriminator import PatchDiscriminator
 from advtex_engine.adversarial.examples import assemble
+from advtex_engine.adversarial.gabor import gabor_filters, gabor_loss
 from advtex_engine.adversarial.losses import adversarial_loss, discriminator_loss, l1_loss, patch_masks
 from advtex_engine.adversarial.operations import plain_operations
 from advtex_engine.adversarial.optimizer import AdversarialOptimizer, crop_size
@@ -180,7 +181,7 @@ def test_losses_are_means_since_the_last_call() -> None:
     of.step()
     first = of.drain_losses()
     assert set(first) == {
-        *("discriminator", "adversarial", "l1", "features", "skipped"),
+        *("discriminator", "adversarial", "l1", "features", "gabor", "skipped"),
         *("accuracy", "accuracy_real", "accuracy_fake", "margin", "spread"),
     }
     assert first["discriminator"] == pytest.approx(2 * 0.693, abs=0.05)
@@ -219,6 +220,25 @@ def test_pretraining_moves_the_discriminator_alone() -> None:
     assert not torch.equal(of.parameters[0], weights)
     of.step()
     assert not torch.equal(of.values, start)
+
+
+def test_the_gabor_term_is_of_the_render_against_its_photograph_where_the_mesh_is() -> None:
+    of = optimizer(preset=dataclasses.replace(PRESET, gabor_weight=2.0))
+    filters = gabor_filters(of.device)
+    pair = of.draw()
+    foreground = pair.foreground.clone()
+    foreground[..., :20] = 0
+    pair = dataclasses.replace(pair, foreground=foreground)
+    fake = of.sampler.image((of.values.detach()[pair.slots.long()] * pair.weights[..., None]).sum(1)) * 2 - 1
+    losses = of.play(pair)
+    assert float(losses.gabor.detach()) == pytest.approx(
+        float(gabor_loss(fake, pair.condition, foreground, filters)), rel=1e-5
+    )
+    with_it = of.texture_gradient(losses)
+    (alone,) = torch.autograd.grad(losses.gabor, of.values, retain_graph=True)
+    without = of.texture_gradient(dataclasses.replace(losses, gabor=torch.zeros(())))
+    torch.testing.assert_close(with_it - without, 2 * alone, atol=1e-6, rtol=1e-3)
+    assert float(alone.abs().max()) > 0
 
 
 @pytest.mark.parametrize("target", ["source", "auxiliary"])

@@ -6,7 +6,7 @@ to teach; where it is certain, no change that the texture can make fools it. A r
 accuracy                       share of the patches that it tells apart, half of which are real
 accuracy_real, accuracy_fake   shares of the real and of the fake patches that it tells for what they are
 margin, spread                 mean logit of the real patches less that of the fake; standard deviation about them
-gradient_adversarial, gradient_l1, gradient_features
+gradient_adversarial, gradient_l1, gradient_features, gradient_gabor
                                L2 norms of what each term adds to the texture's gradient; now and then only
 """
 
@@ -22,7 +22,8 @@ from advtex_engine.core.config import Preset, PyramidLevel
 from advtex_engine.core.errors import Problem
 
 KNOWLEDGE_NAMES = ("accuracy", "accuracy_real", "accuracy_fake", "margin", "spread")
-GAME_NAMES = (*KNOWLEDGE_NAMES, "gradient_adversarial", "gradient_l1", "gradient_features")
+GRADIENT_NAMES = ("gradient_adversarial", "gradient_l1", "gradient_features", "gradient_gabor")
+GAME_NAMES = (*KNOWLEDGE_NAMES, *GRADIENT_NAMES)
 CHANCE = (0.45, 0.55)  # of patches told apart: as many as by guessing
 CERTAIN = 0.95  # more than this
 SHARE = 0.05  # of the run's steps, in which it has to be so on average

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from advtex_engine.adversarial.alignment import example_offsets
 from advtex_engine.adversarial.examples import Examples, InputForm, assemble
+from advtex_engine.adversarial.gabor import gabor_loss
 from advtex_engine.adversarial.losses import Verdict, judge, l1_loss, mean_difference
 from advtex_engine.adversarial.pair_sampler import DrawnPair, PairSampler
 from advtex_engine.render.texture import sample_texels
@@ -25,8 +26,8 @@ class Operations:
     """name: "torch" or "triton". reason: why not the other one; None for the better one.
 
     draw: `PairSampler.draw`. sample_texels: `texture.sample_texels`. offsets: `alignment.example_offsets`. assemble:
-    `examples.assemble`. judge, l1_loss, mean_difference: those of `losses`. average(mean, state, weight): mean +=
-    weight * (state - mean), weight 0-dim on the device.
+    `examples.assemble`. judge, l1_loss, mean_difference: those of `losses`. gabor_loss: `gabor.gabor_loss`.
+    average(mean, state, weight): mean += weight * (state - mean), weight 0-dim on the device.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Operations:
     judge: Callable[[Tensor, Tensor, Tensor, Tensor], Verdict]
     l1_loss: Callable[[Tensor, Tensor, Tensor], Tensor]
     mean_difference: Callable[[Tensor, Tensor], Tensor]
+    gabor_loss: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
     average: Callable[[Tensor, Tensor, Tensor], object]
 
 
@@ -52,5 +54,6 @@ def plain_operations(reason: str | None = None) -> Operations:
         judge=judge,
         l1_loss=l1_loss,
         mean_difference=mean_difference,
+        gabor_loss=gabor_loss,
         average=torch.Tensor.lerp_,
     )

@@ -25,6 +25,7 @@ from advtex_engine.adversarial.alignment import BLOCK, search_bound
 from advtex_engine.adversarial.backend import choose_operations
 from advtex_engine.adversarial.discriminator import MIN_SIZE, PatchDiscriminator
 from advtex_engine.adversarial.examples import Examples, InputForm
+from advtex_engine.adversarial.gabor import gabor_filters
 from advtex_engine.adversarial.game import knowledge
 from advtex_engine.adversarial.losses import TOLD, example_shares, feature_loss
 from advtex_engine.adversarial.operations import Operations, plain_operations
@@ -37,12 +38,12 @@ from advtex_engine.runtime.checkpoint import restore_generator
 from advtex_engine.runtime.shortage import memory_problem
 
 CROP_SHARE = 0.1  # the released code shifts its crop by up to 69 of 640 pixels, about a tenth of the width
-LOSS_NAMES = ("discriminator", "adversarial", "l1", "features", "skipped")
+LOSS_NAMES = ("discriminator", "adversarial", "l1", "features", "gabor", "skipped")
 
 
 @dataclass(frozen=True)
 class Losses:
-    """0-dim tensors: both players' losses, the L1 and feature terms, and 1 where the discriminator is ahead.
+    """0-dim tensors: both players' losses, the L1, feature and Gabor terms, and 1 where the discriminator is ahead.
 
     told: [TOLD], what it tells apart, as `losses.told_apart` has it.
     """
@@ -51,6 +52,7 @@ class Losses:
     adversarial: Tensor
     l1: Tensor
     features: Tensor
+    gabor: Tensor
     ahead: Tensor
     told: Tensor
 
@@ -117,6 +119,9 @@ class AdversarialOptimizer:
         self.form = InputForm(8 if on_gpu else 6, dtype, preset.condition)
         perturbation = preset.perturbation * maps.width
         self.sampler = PairSampler(maps, pairs, kind, self.crop, generator, perturbation)
+        self._filters = gabor_filters(device)
+        weights = (1.0, preset.feature_weight, preset.gabor_weight)
+        self._one, self._feature_weight, self._gabor_weight = (torch.tensor(w, device=device) for w in weights)
         self._sums = torch.zeros(len(LOSS_NAMES) + TOLD, device=device)
         self._summed = 0
         if operations is None and self.operations.name != "torch":
@@ -187,8 +192,10 @@ class AdversarialOptimizer:
             self.update_discriminator(losses)
             self.update_texture(gradient)
             self._take_average()
-        named = (losses.discriminator, losses.adversarial, losses.l1, losses.features, losses.ahead)
-        self._sums += torch.cat((torch.stack(named).detach(), losses.told))
+        named = torch.stack(
+            (losses.discriminator, losses.adversarial, losses.l1, losses.features, losses.gabor, losses.ahead)
+        )
+        self._sums += torch.cat((named.detach(), losses.told))
 
     def count(self, steps: int) -> None:
         """Tells the host of steps that the device was given."""
@@ -210,7 +217,10 @@ class AdversarialOptimizer:
         features = torch.zeros_like(l1)
         if self.preset.feature_weight:
             features = feature_loss(of_fake, of_real, self.operations.mean_difference)
-        return Losses(verdict.discriminator, verdict.adversarial, l1, features, verdict.ahead, verdict.told)
+        gabor = torch.zeros_like(l1)
+        if self.preset.gabor_weight:
+            gabor = self.operations.gabor_loss(fake, pair.condition, pair.foreground, self._filters)
+        return Losses(verdict.discriminator, verdict.adversarial, l1, features, gabor, verdict.ahead, verdict.told)
 
     def _l1(self, pair: DrawnPair, fake: Tensor, shown: Examples) -> Tensor:
         """L1 of the render [1,3,h,w] to what the preset names."""
@@ -231,8 +241,13 @@ class AdversarialOptimizer:
 
     def texture_gradient(self, losses: Losses) -> Tensor:
         """Gradient [slots,3] of the texture's loss; keeps the graph, which the discriminator's gradient needs too."""
-        loss = losses.adversarial + self.schedule.l1_weight * losses.l1 + self.preset.feature_weight * losses.features
-        (gradient,) = torch.autograd.grad(loss, [self.values], retain_graph=True)
+        terms = (losses.adversarial, losses.l1, losses.features, losses.gabor)
+        weights = (self._one, self.schedule.l1_weight, self._feature_weight, self._gabor_weight)
+        # Weights as the gradients of the terms: to weigh and add them up would be a dozen kernels more. A term that the
+        # preset lacks has none.
+        given = [pair for pair in zip(terms, weights, strict=True) if pair[0].requires_grad]
+        outputs, seeds = zip(*given, strict=True)
+        (gradient,) = torch.autograd.grad(outputs, [self.values], seeds, retain_graph=True)
         return gradient
 
     def update_texture(self, gradient: Tensor) -> None:
@@ -295,6 +310,7 @@ class AdversarialOptimizer:
             "gradient_adversarial": (1.0, losses.adversarial),
             "gradient_l1": (self.schedule.l1_weight_at(self.index), losses.l1),
             "gradient_features": (self.preset.feature_weight, losses.features),
+            "gradient_gabor": (self.preset.gabor_weight, losses.gabor),
         }
         norms = {
             name: weight * torch.autograd.grad(term, [self.values], retain_graph=True)[0].norm()

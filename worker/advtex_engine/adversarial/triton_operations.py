@@ -15,6 +15,7 @@ from advtex_engine.adversarial.alignment import BLOCK as OFFSET_BLOCK
 from advtex_engine.adversarial.examples import Examples, InputForm
 from advtex_engine.adversarial.operations import Operations
 from advtex_engine.adversarial.pair_sampler import Choice, DrawnPair, PairSampler
+from advtex_engine.adversarial.triton_gabor import gabor_loss
 from advtex_engine.adversarial.triton_losses import judge, l1_loss, mean_difference
 from advtex_engine.adversarial.triton_offsets import example_offsets
 
@@ -35,6 +36,7 @@ def triton_operations() -> Operations:
         judge=judge,
         l1_loss=l1_loss,
         mean_difference=mean_difference,
+        gabor_loss=gabor_loss,
         average=average,
     )
 

@@ -3,7 +3,7 @@
 Bytes: what a part has to read and write once, each operand as the engine stores it; what a part hands on inside of
 itself costs nothing, as if it were fused. Operations: 2 per multiply-add of the convolutions, exactly; of what is
 done per pixel, texel, face or vertex about so many, as counted in the code. Terms that only some presets have
-(alignment, features, the start's own render) are not counted, nor what xatlas, image codecs and PNG do.
+(alignment, features, Gabor energies, the start's own render) are not counted, nor what xatlas, image codecs and PNG do.
 """
 
 from __future__ import annotations

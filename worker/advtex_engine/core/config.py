@@ -45,6 +45,8 @@ class Preset:
     l1_decay          lambda is multiplied by this `l1_decays` times over the run (paper: 0.8 every 1,000 of 50,000)
     feature_weight    of the distance between what the discriminator's layers respond to the render and to the real
                       example (paper: 0); tolerant to shifts as they are, it averages less than L1 does
+    gabor_weight      of the distance between the Gabor energies of the render and of the source image (paper: 0); it
+                      forgives displacements of some pixels, so it does not blur where views disagree
     averaging         steps over which the resulting texture is averaged (as printed: none, the last state)
     alignment         both examples are moved onto the source image before they are judged (Zhao et al. 2022)
     perturbation      of the view's width, by which virtual motions of the auxiliary camera shift its image at most
@@ -76,6 +78,7 @@ class Preset:
     l1_decay: float = 0.8
     l1_decays: float = 50.0
     feature_weight: float = 0.0
+    gabor_weight: float = 0.0
     averaging: int = 0
     alignment: bool = False
     perturbation: float = 0.0
@@ -138,6 +141,7 @@ STANDARD = Preset(
     l1_target="start",
     l1_decays=0,
     feature_weight=10.0,
+    gabor_weight=5.0,
     averaging=1_000,
     turn=60,
     alignment=True,

@@ -278,9 +278,13 @@ def picture(atlas: Atlas, texture: Tensor, truth: Truth) -> Tensor:
 
 def draw(path: Path, scan: Path, truth: Truth, pictures: Mapping[str, Tensor]) -> None:
     """The photograph from the held-out place that is shown, beside the named `picture`s from there."""
+    contact_sheet([shown_view(scan, truth)], [list(pictures.values())], tuple(pictures), path)
+
+
+def shown_view(scan: Path, truth: Truth) -> View:
+    """The photograph from the held-out place that is shown."""
     file = sorted((scan / "truth" / "heldout").iterdir())[SHOWN_VIEW]
-    photograph = View("held out", truth.cameras[SHOWN_VIEW], torch.from_numpy(cv2.imread(str(file))[..., ::-1].copy()))
-    contact_sheet([photograph], [list(pictures.values())], tuple(pictures), path)
+    return View("held out", truth.cameras[SHOWN_VIEW], torch.from_numpy(cv2.imread(str(file))[..., ::-1].copy()))
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

@@ -8,8 +8,8 @@ Beside every row stand its LPIPS over that of `l1`, as in the paper's table of r
 texels over that of `view_selection`. `--rows suspects` changes the printed recipe, which speckles in 3D, one suspect at
 a time, and takes the preset's choices back one at a time; --steps 6000 tells them apart.
 
-Writes paper.json (one cell per scan and row), paper.md, and renders beside photographs below --results. Stopped and run
-again, it goes on with the cells that are missing.
+Writes paper.json (one cell per scan and row), paper.md, and a render of each, from a place that is held out, below
+--results. Stopped and run again, it goes on with the cells that are missing.
 """
 
 from __future__ import annotations
@@ -17,34 +17,42 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
+import cv2
 import torch
 from harness import (
     RESULTS,
     Results,
     Stopwatch,
-    draw,
     geometric_means,
     load_truth,
     markdown_table,
     needed_lpips,
     parsed_size,
-    picture,
     prepare,
     run_method,
     score_model,
     score_texture,
     shown_mean,
+    shown_view,
     write_report,
 )
 from study import make_scan
+from torch import Tensor
 
+from advtex_engine.adversarial.examples import Examples, assemble
 from advtex_engine.core.config import PRESETS, TextureConfig, resolve_preset
+from advtex_engine.core.monitor import Monitor
 from advtex_engine.methods import MethodInput
+from advtex_engine.metrics.evaluate import heldout_scene
 from advtex_engine.metrics.lpips import Lpips
 from advtex_engine.metrics.speckle import speckle_share
+from advtex_engine.render.pictures import to_bytes
+from advtex_engine.render.render_view import render_view
 from advtex_engine.runtime.devices import choose_device
 
 SIZE, VIEWS, FACES, TURN = "256x192", 60, 20_000, 5.0
@@ -67,16 +75,19 @@ TABLE = {
     "speckle": "speckled texels",
     "of_selection": "of view selection's",
 }
-SHOWN = ("mean", "l1", "view_selection", "adversarial")
+PHOTOGRAPH = "photograph"
+PICTURES = 4
+"""Side by side on the page."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """A method, and what differs from the preset and from the options."""
+    """A method, and what differs from the preset, from the options and from the engine's code."""
 
     method: str = "adversarial"
     preset: dict[str, Any] = dataclasses.field(default_factory=dict)
     options: dict[str, Any] = dataclasses.field(default_factory=dict)
+    code: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
 METHOD_ROWS = {
@@ -103,6 +114,16 @@ FROM_MEAN: dict[str, Any] = {
     "nearest_share": 1.0,
 }
 """As printed, but for the start: black takes thousands of steps to get away from, and hides all else in short runs."""
+
+
+def _fake_without_holes(condition: Tensor, real: Tensor, fake: Tensor, *rest: Any) -> Examples:
+    """The render is shown to the discriminator also where the auxiliary view sees nothing."""
+    visible, offsets, form = rest
+    whole = assemble(condition, real, fake, torch.ones_like(visible), offsets, form)
+    return dataclasses.replace(assemble(condition, real, fake, *rest), fake_input=whole.fake_input)
+
+
+ADVERSARIAL = "advtex_engine.adversarial"
 SUSPECTS = {
     "as printed": Row(preset={**FROM_MEAN, "start": "zero"}),
     "from the mean": Row(preset=FROM_MEAN),
@@ -115,6 +136,16 @@ SUSPECTS = {
     "from the mean, wider pairs": Row(preset={**FROM_MEAN, "max_pair_angle": 30.0}),
     "from the mean, closer pairs": Row(preset={**FROM_MEAN, "min_pair_overlap": 0.7}),
     "from the mean, nearest half": Row(preset={**FROM_MEAN, "nearest_share": 0.5}),
+    "from the mean, small crops": Row(preset={**FROM_MEAN, "max_crop": (96, 96)}),
+    "from the mean, in float32": Row(
+        preset=FROM_MEAN, code={f"{ADVERSARIAL}.optimizer.native_bfloat16": lambda _: False}
+    ),
+    "from the mean, a tenth of theta_z": Row(
+        preset=FROM_MEAN, code={f"{ADVERSARIAL}.pair_sampler.DEPTH_TOLERANCE": {"object": 0.003, "scene": 0.01}}
+    ),
+    "from the mean, fake without holes": Row(
+        preset=FROM_MEAN, code={f"{ADVERSARIAL}.operations.assemble": _fake_without_holes}
+    ),
     "an even rate": Row(preset={"lr_follows": 0.0}),
     "views as photographed": Row(preset={"toned": False}),
     "all pairs": Row(preset={"nearest_share": 1.0}),
@@ -207,17 +238,24 @@ def _run(
     preset = dataclasses.replace(resolve_preset(config, device.type), **row.preset)
     given = dataclasses.replace(inputs[key], config=config, preset=preset)
     watch = Stopwatch()
-    texture = run_method(given, row.method)
+    with ExitStack() as stack:
+        for name, changed in row.code.items():
+            stack.enter_context(patch(name, changed))
+        texture = run_method(given, row.method)
     seconds = watch.seconds
-    kept = arguments.results / cell["scan"].replace(" ", "_")
     if "errors" in cell:
         truth = load_truth(scan)
         scores = score_texture(given.atlas, texture, truth, lpips)
-        if cell["row"] in SHOWN:
-            kept.mkdir(parents=True, exist_ok=True)
-            draw(kept / f"{cell['row']}.png", scan, truth, {cell["row"]: picture(given.atlas, texture, truth)})
+        view = shown_view(scan, truth)
     else:
-        scores = score_model(given, texture, scan, kept / cell["row"], None, arguments.lpips_weights)
+        scores = score_model(given, texture, scan, work.parent / "model", None, arguments.lpips_weights)
+        views = heldout_scene(scan, config, Monitor()).views
+        view = views[len(views) // 2]
+    pictures = {PHOTOGRAPH: view.color / 255, cell["row"]: render_view(given.atlas, texture, view.camera)}
+    for name, image in pictures.items():
+        path = arguments.results / _picture(cell, name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), to_bytes(image)[..., ::-1])
     speckle = speckle_share(texture, given.maps[1].slot_map >= 0)
     results.add(cell, scores if speckle is None else {**scores, "speckle": speckle}, seconds)
 
@@ -229,12 +267,29 @@ def report(arguments: argparse.Namespace, results: Results) -> None:
     keys = dict.fromkeys((cell["settings"]["scan"], cell["settings"]["size"]) for cell in results.cells)
     for scan, size in keys:
         here = [cell for cell in results.cells if (cell["settings"]["scan"], cell["settings"]["size"]) == (scan, size)]
-        rows = [_line(cell, here) for cell in sorted(here, key=lambda cell: float(cell["scores"]["lpips"]))]
+        here.sort(key=lambda cell: float(cell["scores"]["lpips"]))
+        rows = [_line(cell, here) for cell in here]
         body += f"\n## {scan}, {size}\n\n{markdown_table(['row', 'steps', *TABLE.values(), 'seconds'], rows)}"
+        body += _pictures({"scan": scan, "size": size}, [cell["settings"]["row"] for cell in here])
     own = [cell for cell in cells(arguments) if "errors" not in cell]
     lines = {name: [results.find(cell) for cell in own if cell["row"] == name] for name in arguments.rows}
     body += geometric_means("row", lines)
     write_report(arguments.results / "paper.md", "The paper's method beside its peers", results.cells, body)
+
+
+def _picture(cell: dict[str, Any], name: str) -> Path:
+    """Of a row of the cell's scan, or of its photograph."""
+    words = [cell["scan"], cell["size"], name]
+    return Path("pictures", "_".join(words).replace(" ", "_").replace(",", "") + ".jpg")
+
+
+def _pictures(cell: dict[str, Any], rows: list[str]) -> str:
+    """The photograph and what the rows show of the same place, PICTURES in a line."""
+    names = [PHOTOGRAPH, *rows]
+    lines = [names[first : first + PICTURES] for first in range(0, len(names), PICTURES)]
+    return "".join(
+        "\n" + markdown_table(line, [[f"![{name}]({_picture(cell, name)})" for name in line]]) for line in lines
+    )
 
 
 def _line(cell: dict[str, Any], here: list[dict[str, Any]]) -> list[object]:

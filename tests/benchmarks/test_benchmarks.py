@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import compiled
+import cv2
 import discriminator
 import game
 import harness
 import losses
+import numpy as np
 import paper
 import parts
 import probes
@@ -234,16 +236,24 @@ def test_the_paper_s_method_stands_beside_its_peers_and_its_suspects(
     for name, value in {"SIZE": "64x64", "VIEWS": 6, "FACES": 600, "SCAN_FACES": 600, "HOLDOUT": 3}.items():
         monkeypatch.setattr(paper, name, value)
     line = [str(tmp_path / "desk"), "--scan-size", "96x64", "--errors", "geometry", "--levels", "1", "--steps", "2"]
-    line += ["--rows", "l1", "view_selection", "adversarial", "from the mean, fewer texels", "--device", "cpu"]
+    coded = [f"from the mean, {how}" for how in ("in float32", "a tenth of theta_z", "fake without holes")]
+    changed = ["from the mean", "from the mean, fewer texels", *coded]
+    line += ["--rows", "l1", "view_selection", "adversarial", *changed, "--device", "cpu"]
     line += ["--lpips-weights", str(weights), "--results", str(tmp_path / "out")]
     paper.main(line)
     found = json.loads((tmp_path / "out" / "paper.json").read_text())["cells"]
-    assert len(found) == 8
+    assert len(found) == 16
+    ends = {cell["settings"]["row"]: cell["scores"]["lpips"] for cell in found if cell["settings"]["scan"] == "desk"}
+    assert all(ends[row] != ends["from the mean"] for row in coded[1:])  # arithmetic in float32 may be the only one
     assert all(0 <= cell["scores"]["speckle"] < 1 for cell in found)
     page = (tmp_path / "out" / "paper.md").read_text()
     assert page.count("| l1 | - |") == page.count("| adversarial | 2 |") == 2
-    assert (tmp_path / "out" / "geometry_1" / "adversarial.png").stat().st_size > 1000
-    assert (tmp_path / "out" / "desk" / "adversarial" / "sheet.png").stat().st_size > 1000
+    for name in ("geometry_1_64x64", "desk_96x64"):
+        pictures = {row: f"pictures/{name}_{row}.jpg" for row in ("photograph", "l1", "view_selection", "adversarial")}
+        assert all(f"![{row}]({path})" in page for row, path in pictures.items())
+        photograph, *renders = (cv2.imread(str(tmp_path / "out" / path)) for path in pictures.values())
+        for render in renders:
+            assert render.shape == photograph.shape and np.corrcoef(render.ravel(), photograph.ravel())[0, 1] > 0.5
 
     monkeypatch.setattr(paper, "prepare", lambda *_: pytest.fail("every cell is there already"))
     paper.main(line)

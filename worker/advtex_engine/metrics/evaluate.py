@@ -109,7 +109,7 @@ def evaluate(
     displaced from one that is wrong. budget: LPIPS is split into what pose, tone, displacement and content cost
     (`budget.py`). Raises ScanError, ModelError, OptionError, and EngineError when no view can be scored.
     """
-    scene = _load_views(scan, TextureConfig(size=size, holdout=holdout, layout=layout), monitor or Monitor())
+    scene = heldout_scene(scan, TextureConfig(size=size, holdout=holdout, layout=layout), monitor or Monitor())
     target = scene.mesh if reference is None else load_reference(reference)
     atlas, texture = load_model(model)
     if model.suffix.lower() == ".glb":
@@ -238,8 +238,8 @@ def write_json(path: Path, evaluation: Evaluation, described: dict[str, Any]) ->
     write_atomically(path, json_text(content, indent=1).encode() + b"\n")
 
 
-def _load_views(scan: Path, config: TextureConfig, monitor: Monitor) -> Scene:
-    """The scan with the evaluated frames as its views; the others are not decoded."""
+def heldout_scene(scan: Path, config: TextureConfig, monitor: Monitor) -> Scene:
+    """The scan with the frames as its views that config.holdout leaves out of a run; the others are not decoded."""
     with opened(scan) as archive:
         manifest, mesh, _ = sound_scan(archive, config.layout)
         every = config.holdout

@@ -45,6 +45,7 @@ class Method:
     function: "module:function", from the engine's `MethodInput` to a dense texture and its losses; imported by a run.
     draws_pairs: its steps draw pairs of views, and can do with a part of the views on the device at a time.
     plays_game: its steps train a discriminator by the preset, which decides its start, the views' tones and its memory.
+    starts_selected: it begins with the texture of view selection, whose tones the views are given.
     refines_cameras: cameras and exposures are refined first, whatever was asked for.
     weights: "module:function" that raises, before a run has cost anything, if weights lack; empty: it needs none.
     memory: of a step that plays no game.
@@ -57,6 +58,7 @@ class Method:
     function: str
     draws_pairs: bool = False
     plays_game: bool = False
+    starts_selected: bool = False
     refines_cameras: bool = False
     weights: str = ""
     memory: StepMemory = StepMemory()
@@ -103,6 +105,14 @@ BUILT_IN = (
         "refined cameras and smoothly corrected photographs, then the mean",
         "advtex_engine.methods.colormap:colormap",
         refines_cameras=True,
+    ),
+    Method(
+        "gabor",
+        "view selection, then nearer to every photograph's fine structure; in about two minutes",
+        "advtex_engine.methods.gabor:gabor",
+        starts_selected=True,
+        # The responses to twelve filters, and what comes back through them.
+        memory=StepMemory(textures=4, rest=1300),
     ),
     Method(
         "l1",

@@ -135,7 +135,11 @@ def moved(mesh: Mesh, device: torch.device) -> Mesh:
 def run_method(given: MethodInput, method: str) -> Tensor:
     """The method's texture [H,W,3] on the CPU, from the start: what an earlier method left behind is cleared."""
     given.work.clear()
-    if known_methods()[method].plays_game:
+    record = known_methods()[method]
+    if record.starts_selected:
+        preset = dataclasses.replace(given.preset, start="selection", toned=True)
+        given = started(dataclasses.replace(given, preset=preset))
+    elif record.plays_game:
         given = started(given)
     given = dataclasses.replace(given, config=dataclasses.replace(given.config, method=method))
     texture, _ = texture_function(method)(given)

@@ -203,7 +203,7 @@ def test_a_scannet_scene_fits_a_card_of_24_gb() -> None:
     assert half < 0.9 * 8e9, "and one of 8 GB, by blocks"
 
 
-@pytest.mark.parametrize("method", ["mean", "best_view", "l1", "vgg", "colormap"])
+@pytest.mark.parametrize("method", ["mean", "best_view", "l1", "gabor", "vgg", "colormap"])
 def test_other_methods_have_no_discriminator(method: str) -> None:
     work = Workload(10, 320, 240, (512, 512), 100_000, method, PRESETS["standard"])
     parts = estimate(work)

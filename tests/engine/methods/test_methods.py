@@ -17,12 +17,12 @@ from torch import Tensor
 from advtex_engine import methods
 from advtex_engine.adversarial.disagreement import disagreement
 from advtex_engine.adversarial.discriminator import PatchDiscriminator
-from advtex_engine.adversarial.optimizer import AdversarialOptimizer
+from advtex_engine.adversarial.optimizer import AdversarialOptimizer, crop_size
 from advtex_engine.core.config import PRINTED, PyramidLevel, TextureConfig
 from advtex_engine.core.errors import EngineError, Stopped
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Atlas, Camera, Mesh, Scene, View
-from advtex_engine.methods import MethodInput, descent, texture_function
+from advtex_engine.methods import LossPoint, MethodInput, descent, gabor, texture_function
 from advtex_engine.methods.best_view import label_faces
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.sharpest import sharpness
@@ -38,6 +38,7 @@ from advtex_engine.render.view_maps import build_view_maps
 from advtex_engine.runtime.checkpoint import WorkFolder
 from advtex_engine.synthetic.patches import look_at
 from advtex_engine.synthetic.planar import planar_maps
+from advtex_engine.synthetic.scan import synthesize
 from advtex_options.methods import BUILT_IN, Method, known_methods
 
 SIDE, CELLS = 96, 8  # texels of the plane's side, and its quads
@@ -248,7 +249,7 @@ class Stopper(Monitor):
         self.at, self.step = at, 0
 
     def progress(self, step: int, steps: int, losses: Mapping[str, float]) -> None:
-        assert math.isfinite(losses["l1"])
+        assert all(map(math.isfinite, losses.values()))
         self.step = step
 
     def stop_requested(self) -> bool:
@@ -267,6 +268,79 @@ def test_a_descent_that_is_stopped_goes_on_to_the_same_texture(tmp_path: Path) -
 def test_a_stop_at_the_last_step_still_ends_the_run(tmp_path: Path) -> None:
     texture, _ = texture_function("l1")(flat_task(tmp_path, Stopper(30), steps=30)[0])
     assert texture.isfinite().all()
+
+
+def test_gabor_keeps_what_is_sharp_and_sharpens_the_rest_where_photographs_are_displaced(tmp_path: Path) -> None:
+    """Photographs that are all off by two pixels, each in its own direction; one half of the start is blurred."""
+    fine = torch.rand((1, 3, SIDE // 3, SIDE // 3), generator=torch.Generator().manual_seed(4))
+    picture = F.interpolate(fine, (SIDE, SIDE), mode="bilinear")[0].permute(1, 2, 0)
+    shifts = [(0, 0), (2, 0), (-2, 0), (0, 2), (0, -2)]
+    maps = planar_maps(
+        torch.stack([(picture.roll(by, (0, 1)) * 255).round().to(torch.uint8) for by in shifts]), SIDE, SIDE
+    )
+    blurred = F.avg_pool2d(F.pad(picture.permute(2, 0, 1)[None], (1,) * 4, mode="replicate"), 3, 1)[0].permute(1, 2, 0)
+    start = torch.where((torch.arange(SIDE) < SIDE // 2)[:, None, None], blurred, picture)
+    given = task(plane(), (view("0", plane(), truth(), camera((0.5, 0.45, 1.0))),), tmp_path)
+    given = replace(given, maps={1: maps}, means={1: mean_texture(maps)}, start=start)
+
+    def sharp(texture: Tensor) -> tuple[float, float]:
+        """Gradients of the blurred and of the other half, of those of the picture."""
+        found, wanted = (
+            [part.diff(dim=0).abs().mean() + part.diff(dim=1).abs().mean() for part in (of[8:40], of[56:88])]
+            for of in (texture[:, 8:-8], picture[:, 8:-8])
+        )
+        return float(found[0] / wanted[0]), float(found[1] / wanted[1])
+
+    ends = {}
+    for name in ("gabor", "l1"):
+        config, work = TextureConfig(method=name, steps=300), WorkFolder(tmp_path / name, "", Monitor())
+        ends[name], _ = texture_function(name)(replace(given, config=config, work=work))
+    before, gabor_now, l1_now = (sharp(texture) for texture in (start, ends["gabor"], ends["l1"]))
+    assert gabor_now[0] > before[0] + 0.03 > before[0] > l1_now[0]
+    assert 0.97 < gabor_now[1] < 1.03
+    assert l1_now[1] < 0.87
+
+
+def test_gabor_compares_other_windows_at_each_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Crops of a size, at other places: those of a fixed grid would be fitted and not the photograph."""
+    seen = list[Tensor]()
+    monkeypatch.setattr(gabor, "gabor_loss", lambda render, photograph, *_: (seen.append(photograph), render.sum())[1])
+    color = torch.arange(5 * 96 * 120, dtype=torch.int32).view(5, 96, 120, 1).remainder(251).expand(-1, -1, -1, 3)
+    maps = planar_maps(color.to(torch.uint8).contiguous(), 120, 96)
+    given = task(plane(), (view("0", plane(), truth(), camera((0.5, 0.45, 1.0))),), tmp_path, steps=30)
+    gabor.gabor(replace(given, maps={1: maps}, means={1: mean_texture(maps)}))
+    assert {tuple(photograph.shape) for photograph in seen} == {(1, 3, *reversed(crop_size(120, 96)))}
+    assert len({float(photograph[0, 0, 0, 0]) for photograph in seen}) > 20
+
+
+def test_gabor_gives_the_same_texture_stopped_or_not(tmp_path: Path) -> None:
+    whole, losses = texture_function("gabor")(flat_task(tmp_path / "whole", steps=30)[0])
+    with pytest.raises(Stopped, match="after step 11 of 30"):
+        texture_function("gabor")(flat_task(tmp_path / "parts", Stopper(11), steps=30)[0])
+    resumed, later = texture_function("gabor")(flat_task(tmp_path / "parts", steps=30)[0])
+    assert torch.equal(whole, resumed)
+    assert losses == later
+
+
+def test_gabor_begins_with_the_photographs_in_the_tones_of_view_selection(tmp_path: Path) -> None:
+    synthesize(tmp_path / "scan", views=8, width=128, height=96)
+    shown = dict[str, MethodInput]()
+
+    def keep(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
+        shown["given"] = given
+        return gabor.gabor(given)
+
+    config = TextureConfig(method="gabor", steps=5, face_budget=2_000, refine=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("advtex_engine.pipeline.texture_function", lambda _: keep)
+        result = texture_scan(tmp_path / "scan", tmp_path / "out", config, work=tmp_path / "work")
+    given = shown["given"]
+    assert given.start is not None
+    untoned = build_view_maps(given.atlas, given.scene.views, given.scene.kind)
+    assert not torch.equal(given.maps[1].color, untoned.color)
+    assert disagreement(given.maps[1], given.start) < 0.99 * disagreement(untoned, given.start)
+    assert [point["step"] for point in result.report["losses"]] == [1, 2, 3, 4, 5]
+    assert result.report["game"] is None
 
 
 def small_optimizer(around: MethodInput, **ablation: bool) -> AdversarialOptimizer:

@@ -69,6 +69,18 @@ class Workload:
         return known_methods()[self.method].plays_game
 
     @property
+    def starts_selected(self) -> bool:
+        """Whether the texture begins as that of view selection."""
+        method = known_methods()[self.method]
+        return self.preset.start == "selection" if method.plays_game else method.starts_selected
+
+    @property
+    def toned(self) -> bool:
+        """Whether the views are given the tones of the texture that the method begins with."""
+        method = known_methods()[self.method]
+        return self.preset.toned if method.plays_game else method.starts_selected
+
+    @property
     def crop(self) -> tuple[int, int]:
         """The crop (width, height) of a step at full size, in pixels."""
         return crop_size(self.width, self.height, self.preset.max_crop)
@@ -84,13 +96,12 @@ def estimate(work: Workload, on_device: int | None = None) -> dict[str, int]:
     texels = work.texture[0] * work.texture[1]
     shares = sum(1 / scale**2 for scale in work.scales)
     views = work.views * shares if on_device is None else on_device
-    starts = work.plays and work.preset.start == "selection"
     step = _step(work)
     filling = max(FILLING * texels, SPLATTING * work.width * work.height)
     parts = {
         "view_maps": int(views * work.width * work.height * BYTES_PER_PIXEL),
         "slot_maps": int(texels * SLOT * shares),
-        "dense_textures": int(texels * TEXEL * (shares + starts)),
+        "dense_textures": int(texels * TEXEL * (shares + work.starts_selected)),
         **step,
         "probes": _probes(work),
         # Before and after the steps: what a step needs is not there then, apart from the texture's own state.

@@ -1,4 +1,4 @@
-"""A texture that minimizes a loss without an opponent: Adam over the texels, what `l1` and `vgg` share."""
+"""A texture that minimizes a loss without an opponent: Adam over the texels, what `gabor`, `l1` and `vgg` share."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from advtex_engine.core.errors import Diverged, Stopped
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.methods.mean import dense_texture
 from advtex_engine.render.streaming import PairViews
+from advtex_engine.render.view_maps import ViewMaps, foregrounds
 from advtex_engine.runtime.checkpoint import Checkpoints, restore_generator
 
 LR = 1e-3
-"""Learning rate of the first step, in colors of [0, 1]; it falls to zero in a straight line, so that the last steps
-settle and do not shake."""
+"""Learning rate of the first step, in colors of [0, 1], from the mean. It falls to zero in a straight line, so that the
+last steps settle and do not shake."""
 HISTORY_POINTS = 200  # loss means kept for the report and shown as progress
 
 Loss = Callable[[Tensor, int], Tensor]
@@ -30,16 +31,18 @@ def descend(
     steps: int,
     generator: torch.Generator,
     views: PairViews | None = None,
+    rate: float | None = None,
 ) -> tuple[Tensor, list[LossPoint]]:
-    """Minimizes `loss` from the mean texture -> dense texture [H,W,3] float32 in [0,1] and the history of the loss.
+    """Minimizes `loss` from given.start, or else the mean -> dense texture [H,W,3] in [0,1], history of the loss.
 
     name: of the loss in the history. generator: all that `loss` draws from; its state goes into the checkpoint, so a
     run that is stopped and resumed gives the same texture. views: what `loss` draws its views from, if it draws pairs.
-    Raises Stopped, after a checkpoint, when the monitor asks.
+    rate: Adam's at the first step, None: LR. Raises Stopped, after a checkpoint, when the monitor asks.
     """
-    maps = given.maps[1]
-    values = given.means[1][maps.slot_map >= 0].clone().requires_grad_(True)
-    adam = torch.optim.Adam([values], lr=LR, fused=True)
+    maps, rate = given.maps[1], LR if rate is None else rate
+    start = given.means[1] if given.start is None else given.start
+    values = start[maps.slot_map >= 0].clone().requires_grad_(True)
+    adam = torch.optim.Adam([values], lr=rate, fused=True)
     total = torch.zeros((), device=values.device)
     first, losses = 0, list[LossPoint]()
     checkpoints = Checkpoints(given.work, given.config.checkpoint_seconds, steps)
@@ -55,7 +58,7 @@ def descend(
             views.load_state_dict(saved["views"])
     every = max(1, steps // HISTORY_POINTS)
     for step in range(first, steps):
-        adam.param_groups[0]["lr"] = LR * (1 - step / steps)
+        adam.param_groups[0]["lr"] = rate * (1 - step / steps)
         value = loss(values, step)
         (values.grad,) = torch.autograd.grad(value, [values])
         adam.step()
@@ -79,3 +82,11 @@ def descend(
         if stop:
             raise Stopped(f"stopped after step {done} of {steps}; resume goes on from there")
     return dense_texture(maps, values.detach()).clamp(0, 1), losses
+
+
+def drawn_views(maps: ViewMaps, steps: int | None, passes: int, generator: torch.Generator) -> list[int]:
+    """A view for each step, all that see the mesh in a new random order per pass; steps: None for whole passes."""
+    seen: list[int] = foregrounds(maps).nonzero().flatten().tolist()
+    steps = steps or passes * len(seen)
+    orders = [torch.randperm(len(seen), generator=generator).tolist() for _ in range(-(-steps // len(seen)))]
+    return [seen[index] for order in orders for index in order][:steps]

@@ -25,7 +25,7 @@ class MethodInput:
     atlas.mesh is on the device that the run uses; scene's views stay on the CPU.
     means: dense textures [H,W,3] float32 in [0,1], defined on every texel.
     live: shows the texture while it is optimized.
-    start: dense texture [H,W,3] that the adversarial methods start from; None: preset.start needs no more than `means`.
+    start: dense texture [H,W,3] that the method starts from, whose tones the views may have; None: `means`, or black.
     painted: [H,W] int16, the view that each texel of `start` shows, -1 = none; None: not known.
     on_device: views of full size that may be on the device at a time, while pairs are drawn; None: all are.
     facts: what the method says about how it ran, by name: "step" and "game" for the report, whose "refinement" takes

@@ -10,10 +10,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from advtex_engine.methods.descent import descend
+from advtex_engine.methods.descent import descend, drawn_views
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.render.texture import bilinear_footprint, decode_uv, sample_texels
-from advtex_engine.render.view_maps import ViewMaps, foregrounds
+from advtex_engine.render.view_maps import ViewMaps
 
 PASSES = 20  # over all views, unless the number of steps is asked for
 
@@ -25,21 +25,14 @@ def l1(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     """
     maps, device = given.maps[1], given.maps[1].device
     generator = torch.Generator().manual_seed(given.config.seed)
-    seen: list[int] = foregrounds(maps).nonzero().flatten().tolist()
-    steps = given.config.steps or PASSES * len(seen)
-    order = [seen[index] for _ in range(-(-steps // len(seen))) for index in _shuffled(len(seen), generator)]
+    order = drawn_views(maps, given.config.steps, PASSES, generator)
     size = torch.tensor(maps.slot_map.shape[::-1], dtype=torch.float32, device=device)
 
     def distance(values: Tensor, step: int) -> Tensor:
         photograph, slots, weights = _footprints(maps.only(order[step]), size)
         return (sample_texels(values, slots, weights) - photograph).abs().mean()
 
-    return descend(given, "l1", distance, steps, generator)
-
-
-def _shuffled(count: int, generator: torch.Generator) -> list[int]:
-    drawn: list[int] = torch.randperm(count, generator=generator).tolist()
-    return drawn
+    return descend(given, "l1", distance, len(order), generator)
 
 
 def _footprints(view: ViewMaps, size: Tensor) -> tuple[Tensor, Tensor, Tensor]:

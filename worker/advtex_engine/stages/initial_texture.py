@@ -1,4 +1,4 @@
-"""What the method begins with: mean textures, and for those that play a game the preset's start and tones."""
+"""What the method begins with: mean textures, and for some the texture of view selection and views in one tone."""
 
 from __future__ import annotations
 
@@ -31,13 +31,12 @@ def method_input(
         live = Live(scene, atlas, monitor)
         given = MethodInput(scene, atlas, maps, means, preset, config, monitor, budget.texture_folder(), live)
         given = replace(given, on_device=budget.limits.on_device)
-        if work.plays:
-            if preset.start == "selection":
-                start, painted = _selected_start(given)
-                given = replace(given, start=start, painted=painted)
-            if preset.toned:
-                for level in maps.values():
-                    tone_views(level, starting_texture(given))
+        if work.starts_selected:
+            start, painted = _selected_start(given)
+            given = replace(given, start=start, painted=painted)
+        if work.toned:
+            for level in maps.values():
+                tone_views(level, starting_texture(given))
     stages.save()
     return given
 

@@ -1,0 +1,60 @@
+"""View selection's texture, descended to what all photographs agree on but for displacement: no opponent is trained.
+
+Each step compares a view's photograph with the texture's render by Gabor energies (`adversarial/gabor.py`), which
+forgive some pixels, so that every view adds to a texture that begins as a patchwork of single ones. On five scans the
+adversarial game, of whose losses this is one, ends at the same distance after six times the time
+(`tests/benchmarks/losses.py`).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from advtex_engine.adversarial.gabor import gabor_filters, gabor_loss
+from advtex_engine.adversarial.optimizer import crop_size
+from advtex_engine.methods.descent import descend, drawn_views
+from advtex_engine.methods.inputs import LossPoint, MethodInput
+from advtex_engine.render.texture import bilinear_footprint, decode_uv, sample_texels
+from advtex_engine.render.view_maps import ViewMaps
+
+PASSES = 20  # over all views, unless the number of steps is asked for
+LR = 5e-4  # of the first step, in colors of [0, 1]
+
+
+def gabor(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
+    """One view per step, all views in a new random order per pass -> [H,W,3] float32 in [0,1] and the losses.
+
+    From given.start, whose tones the views have. Raises Stopped, after a checkpoint.
+    """
+    maps, device = given.maps[1], given.maps[1].device
+    generator = torch.Generator().manual_seed(given.config.seed)
+    order = drawn_views(maps, given.config.steps, PASSES, generator)
+    width, height = crop_size(maps.width, maps.height)
+    # Windows and octaves lie elsewhere each time, or the texture would fit those of one grid.
+    margins = torch.tensor([maps.width - width + 1, maps.height - height + 1])
+    corners = (torch.rand((len(order), 2), generator=generator) * margins).long().tolist()
+    filters = gabor_filters(device)
+    size = torch.tensor(maps.slot_map.shape[::-1], dtype=torch.float32, device=device)
+
+    def unlikeness(values: Tensor, step: int) -> Tensor:
+        photograph, foreground, slots, weights = _seen(maps.only(order[step]), corners[step], (width, height), size)
+        render = sample_texels(values, slots, weights).view(1, height, width, 3).permute(0, 3, 1, 2) * 2 - 1
+        return gabor_loss(render, photograph, foreground, filters)
+
+    return descend(given, "gabor", unlikeness, len(order), generator, rate=LR)
+
+
+def _seen(
+    view: ViewMaps, corner: list[int], crop: tuple[int, int], size: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """A crop of one view: photograph [1,3,h,w] in [-1,1], foreground [1,1,h,w], slots [h*w,4] and weights [h*w,4]."""
+    (left, top), (width, height) = corner, crop
+    window = (slice(top, top + height), slice(left, left + width))
+    color, uv = (part.view(view.height, view.width, -1)[window] for part in (view.color, view.uv))
+    foreground = view.depth.view(view.height, view.width)[window] > 0
+    texels, weights = bilinear_footprint(decode_uv(uv.reshape(-1, 2)) * size, *reversed(view.slot_map.shape))
+    # A background pixel's weight is 0, so any row may stand for the texel that nobody owns.
+    slots = view.slot_map.flatten().index_select(0, texels.flatten()).view(texels.shape).clamp(min=0)
+    photograph = color.permute(2, 0, 1)[None].to(torch.float32) / 127.5 - 1
+    return photograph, foreground[None, None], slots, weights * foreground.reshape(-1, 1)

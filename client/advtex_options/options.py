@@ -16,7 +16,7 @@ from types import MappingProxyType
 from typing import Any, TypeVar, get_type_hints
 
 from advtex_options.box import FORM, parse_box
-from advtex_options.methods import METHOD_HELP
+from advtex_options.methods import AUTO, METHOD_HELP
 from advtex_options.outputs import OUTPUTS
 from advtex_options.words import PRESET_HELP, Preset
 from advtex_scan.layouts import LAYOUT_NAMES
@@ -76,15 +76,17 @@ def option(default: T, help: str, label: str, *, unset: str = "", **more: Any) -
 class Options:
     """What a user may set. Everything has a default that suits most scans."""
 
-    preset: str = option(Preset.auto.value, "how much work the optimization does", "Preset", choices=PRESET_HELP)
+    preset: str = option(
+        Preset.auto.value, "what is best and fast, or a recipe of the adversarial method", "Preset", choices=PRESET_HELP
+    )
     method: str = option(
-        "adversarial",
+        AUTO,
         "how the texture is made",
         "Method",
         choices=METHOD_HELP,
         others="install the package that brings it",
     )
-    steps: int | None = option(None, "steps of the optimization", "Steps", unset="the preset's", low=1, high=1_000_000)
+    steps: int | None = option(None, "steps of the optimization", "Steps", unset="the method's", low=1, high=1_000_000)
     face_budget: int | None = option(
         None,
         "simplify a larger mesh to this many faces",

@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class Preset(StrEnum):
-    """How much work the optimization does. The step counts live in the engine's presets."""
+    """`auto`, or a recipe of the adversarial method. The step counts live in the engine's presets."""
 
     auto = "auto"
     paper = "paper"
@@ -16,16 +16,16 @@ class Preset(StrEnum):
 
 
 PRESET_HELP: dict[Preset, str] = {
-    Preset.auto: "full on a GPU, standard on a CPU",
-    Preset.paper: "the paper's method: starts from the mean of all photographs, no refined cameras, 50,000 steps",
-    Preset.full: "starts from the best photograph per face, 50,000 steps; for GPUs",
-    Preset.standard: "starts from the best photograph per face, 1,500 steps; minutes on a CPU",
-    Preset.preview: "starts from the best photograph per face, coarse to fine; about two minutes on a CPU",
+    Preset.auto: "best and fast on every device: gabor, one photograph per face, sharpened by all of them",
+    Preset.paper: "adversarial as in the paper, from the mean of all photographs, no refined cameras, 50,000 steps",
+    Preset.full: "adversarial, from the best photograph per face, 50,000 steps; for GPUs",
+    Preset.standard: "adversarial, from the best photograph per face, 1,500 steps; minutes on a CPU",
+    Preset.preview: "adversarial, from the best photograph per face, coarse to fine; two minutes on a CPU",
 }
 
 
 PRESET_COST: dict[Preset, str] = {
-    Preset.auto: "as full on a GPU, as standard on a CPU",
+    Preset.auto: "about half a minute for views of 320x240 on 2 CPU cores, 2 minutes for 640x480",
     Preset.paper: "about 2 hours for views of 320x240 on 2 CPU cores, 8 hours for 640x480; much less on a GPU",
     Preset.full: "about 2 hours for views of 320x240 on 2 CPU cores, 8 hours for 640x480; much less on a GPU",
     Preset.standard: "about 3 minutes for views of 320x240 on 2 CPU cores, 5 minutes for 640x480",

@@ -24,7 +24,7 @@ def test_every_preset_is_explained() -> None:
 
 
 def test_defaults_suit_most_scans() -> None:
-    defaults = {"preset": "auto", "method": "adversarial", "max_texture_size": 4096, "seed": 0}
+    defaults = {"preset": "auto", "method": "auto", "max_texture_size": 4096, "seed": 0}
     assert JobOptions().model_dump() == defaults
 
 

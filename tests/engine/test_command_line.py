@@ -24,7 +24,7 @@ def test_help_does_not_load_torch() -> None:
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        (["--steps", "0"], "steps 0 is out of bounds; give 1 to 1000000, or leave it out (the preset's)"),
+        (["--steps", "0"], "steps 0 is out of bounds; give 1 to 1000000, or leave it out (the method's)"),
         (["--size", "8x8"], "size 8x8 is out of bounds; give 64 to 4096 pixels a side"),
         (["--size", "big"], "size 'big' is no size; give it as WIDTHxHEIGHT"),
         (["--preset", "best"], "preset 'best' is unknown; choose one of auto, paper"),

@@ -11,7 +11,7 @@ from typing import Literal
 
 from advtex_engine.core.errors import OptionError
 from advtex_options import Options, described, refusal
-from advtex_options.methods import known_methods
+from advtex_options.methods import chosen_method, known_methods
 from advtex_options.options import FACE_BUDGET, MAX_VIEWS
 
 
@@ -171,7 +171,8 @@ PRESETS: dict[str, Preset] = {
 class TextureConfig(Options):
     """What one run is asked to do: the user's options, and what is the machine's or the engine's own.
 
-    preset            a name of PRESETS, or "auto": full on a GPU, standard on a CPU
+    preset            a name of PRESETS, or "auto": of what plays a game full on a GPU, standard on a CPU
+    method            "auto" becomes the name of what it stands for
     size              working size (width, height) of the views in pixels; None keeps the scan's
     max_views         of a longer scan, these many frames are chosen; fewer where their maps would not fit into memory
     memory_bytes      what the run may take of a GPU that others use too; None: all that is free
@@ -194,6 +195,7 @@ class TextureConfig(Options):
         return known_methods()[self.method].refines_cameras or (self.refine and self.preset != "paper")
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "method", chosen_method(self.method, self.preset))
         for name in described():
             value = getattr(self, name)
             if value is not None and (words := refusal(name, value)) is not None:

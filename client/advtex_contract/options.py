@@ -82,7 +82,7 @@ def _described_fields() -> dict[str, Any]:
             default = kind(default)
         words = about.help if default is not None else f"{about.help}; left out: {about.unset}"
         longest = (200 if about.form else 40) if kind in (str, str | None) else None
-        offer = partial(_offer, about.choices) if kind is str and about.choices is not None else None
+        offer = partial(_offer, about.choices) if name in _OPEN and about.choices is not None else None
         told: dict[str, Any] = {"description": words, "json_schema_extra": offer}
         if about.several and about.choices is not None:
             word = "|".join(map(re.escape, about.choices))
@@ -100,11 +100,12 @@ def _malformed(name: str, value: object) -> str | None:
 
 def _offer(choices: Mapping[str, str], schema: dict[str, Any]) -> None:
     """Describe an open word: one of those that are known where it is described, or another."""
-    word = {name: schema.pop(name) for name in ("type", "maxLength")}
-    schema["anyOf"] = [{"type": "string", "enum": list(choices)}, word]
+    schema["anyOf"] = [{"type": "string", "enum": list(choices)}, *schema["anyOf"]]
 
 
 _NARROWER: Mapping[str, Any] = {"preset": Preset}
+_OPEN = {"layout", "method"}
+"""Options whose words another version, or another installation, may have more of: not checked where jobs are read."""
 
 if TYPE_CHECKING:
 
@@ -159,7 +160,3 @@ def misunderstood(stored: Mapping[str, Any]) -> str | None:
     except ValueError as error:
         return str(error)
     return None
-
-
-_OPEN = {"layout", "method"}
-"""Options whose words another version, or another installation, may have more of: not checked where jobs are read."""

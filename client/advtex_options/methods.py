@@ -161,7 +161,7 @@ def known_methods() -> Mapping[str, Method]:
             method = point.load()
             if not isinstance(method, Method):
                 raise TypeError(f"{point.value} is a {type(method).__name__} and no advtex_options.methods.Method")
-            if method.name in (AUTO, *known):
+            if method.name in known:
                 raise ValueError(f"the name {method.name} is taken")
         except Exception as error:  # whatever a package of others does
             log.warning(
@@ -177,28 +177,22 @@ def _package(point: EntryPoint) -> str:
     return point.dist.name if point.dist is not None else point.module
 
 
-AUTO = "auto"
-AUTO_HELP = "gabor; or adversarial, where one of its presets is asked for"
-
-
-def chosen_method(method: str, preset: str) -> str:
-    """The name of a method, also where AUTO is asked for: presets but `auto` are recipes of the adversarial method."""
-    if method != AUTO:
-        return method
-    return "gabor" if preset == "auto" else "adversarial"
+def chosen_method(method: str | None, preset: str) -> str:
+    """The method's name, also where none is asked for: presets but `auto` are recipes of the adversarial method."""
+    return method or ("gabor" if preset == "auto" else "adversarial")
 
 
 class _Help(Mapping[str, str]):
-    """AUTO's help, and that of `known_methods`, which are looked for when it is read."""
+    """The help of `known_methods`, which are looked for when it is read."""
 
     def __getitem__(self, name: str) -> str:
-        return AUTO_HELP if name == AUTO else known_methods()[name].help
+        return known_methods()[name].help
 
     def __iter__(self) -> Iterator[str]:
-        return iter((AUTO, *known_methods()))
+        return iter(known_methods())
 
     def __len__(self) -> int:
-        return 1 + len(known_methods())
+        return len(known_methods())
 
 
 METHOD_HELP: Mapping[str, str] = _Help()

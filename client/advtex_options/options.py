@@ -16,7 +16,7 @@ from types import MappingProxyType
 from typing import Any, TypeVar, get_type_hints
 
 from advtex_options.box import FORM, parse_box
-from advtex_options.methods import AUTO, METHOD_HELP
+from advtex_options.methods import METHOD_HELP
 from advtex_options.outputs import OUTPUTS
 from advtex_options.words import PRESET_HELP, Preset
 from advtex_scan.layouts import LAYOUT_NAMES
@@ -79,10 +79,11 @@ class Options:
     preset: str = option(
         Preset.auto.value, "what is best and fast, or a recipe of the adversarial method", "Preset", choices=PRESET_HELP
     )
-    method: str = option(
-        AUTO,
+    method: str | None = option(
+        None,
         "how the texture is made",
         "Method",
+        unset="gabor, or adversarial where one of its presets is asked for",
         choices=METHOD_HELP,
         others="install the package that brings it",
     )

@@ -12,6 +12,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from starlette.concurrency import run_in_threadpool
 
 from advtex_options import Options
+from advtex_options.methods import chosen_method
 from advtex_server.events import PING_SECONDS
 from advtex_server.waiting import tell_why, waiting_reason
 from advtex_store.models import JobRow
@@ -51,7 +52,7 @@ def job_summary(row: JobRow) -> JobSummary:
         label=row.label,
         batch=row.batch,
         preset=str(row.options.get("preset", Options.preset)),
-        method=str(row.options.get("method", Options.method)),
+        method=chosen_method(row.options.get("method"), row.options.get("preset", Options.preset)),
         stage=progress.get("stage", ""),
         step=progress.get("step", 0),
         steps=progress.get("steps", 0),

@@ -261,9 +261,9 @@ def _result_file(job_id: str, stored: Mapping[str, Any]) -> ResultFile:
     )
 
 
-def _check_method(name: str) -> None:
+def _check_method(name: str | None) -> None:
     """Refuse a method that is not known here, before anything is done for it."""
-    if (words := refusal("method", name)) is not None:
+    if name is not None and (words := refusal("method", name)) is not None:
         where, remedy = "body.options.method", "choose one of these, or ask the operator to install the package"
         detail = ErrorDetail(code="unknown_method", where=where, message=words, remedy=remedy)
         raise ApiError(ErrorCode.invalid_options, f"{where}: {words}", [detail])

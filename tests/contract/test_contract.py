@@ -24,7 +24,7 @@ def test_every_preset_is_explained() -> None:
 
 
 def test_defaults_suit_most_scans() -> None:
-    defaults = {"preset": "auto", "method": "auto", "max_texture_size": 4096, "seed": 0}
+    defaults = {"preset": "auto", "max_texture_size": 4096, "seed": 0}
     assert JobOptions().model_dump() == defaults
 
 
@@ -99,9 +99,10 @@ def test_words_that_another_installation_may_know_are_refused_where_they_are_cho
 
 
 def test_known_methods_are_offered() -> None:
-    known, another = JobOptions.model_json_schema()["properties"]["method"]["anyOf"]
+    known, another, none = JobOptions.model_json_schema()["properties"]["method"]["anyOf"]
     assert known["enum"] == list(METHOD_HELP)
     assert another == {"type": "string", "maxLength": 40}
+    assert none == {"type": "null"}
 
 
 @given(st.text(max_size=250))

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from advtex_contract.options import JobOptions, chosen_options
-from advtex_options.methods import AUTO, BUILT_IN, METHOD_HELP, Method, chosen_method, known_methods
+from advtex_options.methods import BUILT_IN, METHOD_HELP, Method, chosen_method, known_methods
 
 OURS = [method.name for method in BUILT_IN]
 SOUND = """
@@ -43,23 +43,23 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
 
 def test_names_are_told_apart() -> None:
     assert len(set(OURS)) == len(OURS)
-    assert list(METHOD_HELP) == [AUTO, *OURS], "no package brings a method where tests run"
-    assert JobOptions().method == AUTO, "the page's choice begins with what is usual"
+    assert list(METHOD_HELP) == OURS, "no package brings a method where tests run"
+    assert JobOptions().method is None
 
 
 @pytest.mark.parametrize(
     ("asked", "preset", "chosen"),
     [
-        (AUTO, "auto", "gabor"),
-        (AUTO, "standard", "adversarial"),
-        (AUTO, "paper", "adversarial"),
+        (None, "auto", "gabor"),
+        (None, "standard", "adversarial"),
+        (None, "paper", "adversarial"),
         ("adversarial", "auto", "adversarial"),
         ("gabor", "preview", "gabor"),
         ("l1", "paper", "l1"),
     ],
 )
-def test_auto_is_gabor_unless_a_recipe_of_the_adversarial_method_is_asked_for(
-    asked: str, preset: str, chosen: str
+def test_it_is_gabor_unless_a_recipe_of_the_adversarial_method_is_asked_for(
+    asked: str | None, preset: str, chosen: str
 ) -> None:
     assert chosen_method(asked, preset) == chosen
     assert chosen in known_methods()
@@ -70,7 +70,7 @@ def test_a_package_brings_a_method(install: Install) -> None:
     assert list(known_methods()) == [*OURS, "latest"]
     assert METHOD_HELP["latest"] == "each face from the latest view"
     assert chosen_options({"method": "latest"}).method == "latest"
-    assert JobOptions.model_json_schema()["properties"]["method"]["anyOf"][0]["enum"] == [AUTO, *OURS, "latest"]
+    assert JobOptions.model_json_schema()["properties"]["method"]["anyOf"][0]["enum"] == [*OURS, "latest"]
 
 
 def test_a_package_that_is_imported_before_the_registry_is_asked(install: Install) -> None:

@@ -18,7 +18,6 @@ import pytest
 import advtex_viewer
 from advtex_contract.errors import JOB_EXPLANATIONS, ErrorCode
 from advtex_contract.jobs import RETRYABLE, STATES, TERMINAL, JobError
-from advtex_contract.options import JobOptions
 from advtex_contract.stages import STAGE_LABELS
 from advtex_server import static_files
 from advtex_server.authentication import KNOWN_SECONDS
@@ -252,7 +251,7 @@ def test_the_words_of_states_and_stages_are_the_contracts(browser: httpx.Client)
         s for s in STATES if s in TERMINAL
     ]
     assert {state for state, told in words["states"].items() if told["retryable"]} == RETRYABLE
-    assert words["usual_method"] == JobOptions().method
+    assert words["usual_method"] == "gabor"
     for state, facts in STATES.items():
         assert words["states"][state]["label"] == facts.label
         assert f'<option value="{state}">{facts.label}</option>' in page

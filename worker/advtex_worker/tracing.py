@@ -9,6 +9,7 @@ from typing import Any
 from sqlalchemy.exc import SQLAlchemyError
 
 from advtex_contract.jobs import JobState
+from advtex_options.methods import chosen_method
 from advtex_store.errors import RecordNotFound
 from advtex_store.records import Claim
 from advtex_store.store import Store
@@ -44,7 +45,7 @@ def traced(store: Store, claim: Claim) -> Iterator[AttemptTrace]:
     traces = open_traces("advtex-worker")
     facts: dict[str, Any] = {"job": claim.job_id, "attempt": claim.attempt, "owner": claim.owner}
     traces.span("queue", claim.traceparent, start=claim.waiting_since, **facts).end()
-    facts |= {"method": claim.options.method, "preset": claim.options.preset.value}
+    facts |= {"method": chosen_method(claim.options.method, claim.options.preset), "preset": claim.options.preset.value}
     trace = AttemptTrace(traces.span("attempt", claim.traceparent, **facts))
     try:
         yield trace

@@ -20,6 +20,7 @@ from advtex_contract.jobs import RETRYABLE, STATES, JobState, Label
 from advtex_contract.options import PRESET_COST, PRESET_HELP, Preset
 from advtex_contract.stages import STAGE_LABELS
 from advtex_options import Options, described
+from advtex_options.methods import chosen_method
 from advtex_options.options import kind_of
 from advtex_server import static_files
 from advtex_server.authentication import Authenticator
@@ -56,7 +57,7 @@ _WORDS = {
         for state, facts in STATES.items()
     },
     "stages": STAGE_LABELS,
-    "usual_method": Options.method,
+    "usual_method": chosen_method(Options.method, Options.preset),
 }
 _PRESETS = (Preset.auto, Preset.preview, Preset.standard, Preset.full, Preset.paper)  # by their cost
 

@@ -172,13 +172,14 @@ class TextureConfig(Options):
     """What one run is asked to do: the user's options, and what is the machine's or the engine's own.
 
     preset            a name of PRESETS, or "auto": of what plays a game full on a GPU, standard on a CPU
-    method            "auto" becomes the name of what it stands for
+    method            its name, also where none is asked for
     size              working size (width, height) of the views in pixels; None keeps the scan's
     max_views         of a longer scan, these many frames are chosen; fewer where their maps would not fit into memory
     memory_bytes      what the run may take of a GPU that others use too; None: all that is free
     refine            cameras, exposures and vertices are refined first; never for the preset "paper", which does not
     """
 
+    method: str = ""
     face_budget: int = FACE_BUDGET
     max_views: int = MAX_VIEWS
     lossless: bool = False

@@ -108,11 +108,11 @@ BUILT_IN = (
     ),
     Method(
         "gabor",
-        "view selection, then nearer to every photograph's fine structure; in about two minutes",
+        "view selection, then nearer to every photograph's fine structure; in about three minutes",
         "advtex_engine.methods.gabor:gabor",
         starts_selected=True,
         # The responses to twelve filters, and what comes back through them.
-        memory=StepMemory(textures=4, rest=1300),
+        memory=StepMemory(textures=4, rest=2400),
     ),
     Method(
         "l1",

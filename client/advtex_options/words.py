@@ -25,7 +25,7 @@ PRESET_HELP: dict[Preset, str] = {
 
 
 PRESET_COST: dict[Preset, str] = {
-    Preset.auto: "about half a minute for views of 320x240 on 2 CPU cores, 2 minutes for 640x480",
+    Preset.auto: "about a minute for views of 320x240 on 2 CPU cores, 3 minutes for 640x480",
     Preset.paper: "about 2 hours for views of 320x240 on 2 CPU cores, 8 hours for 640x480; much less on a GPU",
     Preset.full: "about 2 hours for views of 320x240 on 2 CPU cores, 8 hours for 640x480; much less on a GPU",
     Preset.standard: "about 3 minutes for views of 320x240 on 2 CPU cores, 5 minutes for 640x480",

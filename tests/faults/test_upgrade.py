@@ -133,10 +133,12 @@ class User:
         return str(self.ask(side, "POST", "/v1/jobs", 201, json=body).json()["id"])
 
     def jobs(self, side: int) -> list[dict[str, Any]]:
-        """All of them, with the options that were given: the earlier release tells of the others as null."""
+        """All of them, with the options that were given: the earlier release tells null or its own of others."""
         found: list[dict[str, Any]] = self.ask(side, "GET", "/v1/jobs").json()["jobs"]
         for job in found:
             job["options"] = {name: value for name, value in job["options"].items() if value is not None}
+            if side == EARLIER_SIDE:
+                assert job["options"].pop("method") == "adversarial", "nobody has asked for one"
         return found
 
     def step_of(self, job: str) -> int:

@@ -2,8 +2,7 @@
 
 Each step compares a view's photograph with the texture's render by Gabor energies (`adversarial/gabor.py`), which
 forgive some pixels, so that every view adds to a texture that begins as a patchwork of single ones. On five scans the
-adversarial game, of whose losses this is one, ends at the same distance after six times the time
-(`tests/benchmarks/losses.py`).
+adversarial game, of whose losses this is one, ends at the same distance (`tests/benchmarks/results/scans_320`).
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ from advtex_engine.render.view_maps import ViewMaps
 
 PASSES = 20  # over all views, unless the number of steps is asked for
 LR = 5e-4  # of the first step, in colors of [0, 1]
-MAX_CROP = (384, 288)  # pixels; larger views are seen in parts, for cheaper steps
 
 
 def gabor(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
@@ -31,7 +29,7 @@ def gabor(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     maps, device = given.maps[1], given.maps[1].device
     generator = torch.Generator().manual_seed(given.config.seed)
     order = drawn_views(maps, given.config.steps, PASSES, generator)
-    width, height = crop_size(maps.width, maps.height, MAX_CROP)
+    width, height = crop_size(maps.width, maps.height)
     # Windows and octaves lie elsewhere each time, or the texture would fit those of one grid.
     margins = torch.tensor([maps.width - width + 1, maps.height - height + 1])
     corners = (torch.rand((len(order), 2), generator=generator) * margins).long().tolist()

@@ -57,9 +57,8 @@ Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
 VARIANTS: dict[str, dict[str, Any]] = {
     "gabor": {},
     "no maximum": {"WINDOW": 1, "STRIDE": 1},
-    "windows of 3": {"WINDOW": 3},
-    "windows of 5": {"WINDOW": 5},
-    "windows of 11": {"WINDOW": 11},
+    "windows of 4": {"WINDOW": 4},
+    "windows of 12": {"WINDOW": 12},
     "faint 0.05": {"FAINT": 0.05},
     "faint 0.1": {"FAINT": 0.1},
     "faint 0.4": {"FAINT": 0.4},

@@ -21,8 +21,9 @@ WAVELENGTH = 3.0  # pixels
 ORIENTATIONS = 6
 SIZE = 7  # pixels a side of a filter
 OCTAVES = 3  # images of half the size each
-WINDOW = 7  # pixels a side, of which the greatest energy counts
 STRIDE = 4  # pixels between two windows
+WINDOW = 8  # pixels a side, of which the greatest energy counts; whole strides
+PATCH = SIZE + STRIDE - 1  # pixels a side that the filters of a block of STRIDE x STRIDE places lie in
 FAINT = 0.2  # energies well below count as none; of colors in [0, 1]
 TINY = 1e-6  # under the root of the energy, which has no slope at 0
 LUMA = (0.299, 0.587, 0.114)
@@ -52,36 +53,65 @@ def gabor_loss(render: Tensor, photograph: Tensor, foreground: Tensor, filters: 
     photograph elsewhere. filters: of `gabor_filters`, on their device. Octaves that are smaller than a window are left
     out.
     """
+    matrix = _placed(filters)
     with torch.no_grad():
-        named = _shares(photograph, filters)
-    shown = _shares(torch.where(foreground > 0, render, photograph), filters)
+        gray = _gray(photograph)
+        named = _shares(gray, matrix)
+    shown = _shares(torch.where(foreground[:, 0] > 0, _gray(render), gray), matrix)
     distances = [F.mse_loss(ours, theirs) for ours, theirs in zip(shown, named, strict=True)]
     return ORIENTATIONS * torch.stack(distances).sum() if distances else torch.zeros((), device=render.device)
 
 
-def _shares(image: Tensor, filters: Tensor) -> list[Tensor]:
-    """[1,3,h,w] -> per octave [1,ORIENTATIONS,...], for each window a vector that is shorter than 1."""
-    red, green, blue = (part / 2 for part in LUMA)  # differences as of colors in [0, 1]
-    gray = red * image[:, :1] + green * image[:, 1:2] + blue * image[:, 2:]
+def _gray(image: Tensor) -> Tensor:
+    """[1,3,h,w] in [-1,1] -> [1,h,w], with differences as of colors in [0,1]."""
+    return image.permute(0, 2, 3, 1) @ image.new_tensor([part / 2 for part in LUMA])
+
+
+def _shares(gray: Tensor, matrix: Tensor) -> list[Tensor]:
+    """[1,h,w] -> per octave [1,ORIENTATIONS,...], for each window a vector that is shorter than 1."""
     found: list[Tensor] = []
     while len(found) < OCTAVES and min(gray.shape[-2:]) >= SIZE + WINDOW - 1:
-        responses: Tensor = _Filtered.apply(gray, filters)  # type: ignore[no-untyped-call]
-        squares = responses.square().view(2, ORIENTATIONS, *responses.shape[-2:]).sum(0, keepdim=True)
-        energies = (F.max_pool2d(squares, WINDOW, STRIDE) + TINY).sqrt()
+        blocks: Tensor = _GreatestSquares.apply(gray[0], matrix)  # type: ignore[no-untyped-call]
+        energies = (F.max_pool2d(blocks[None], WINDOW // STRIDE, 1) + TINY).sqrt()
         found.append(energies / (energies.square().sum(1, keepdim=True) + FAINT**2).sqrt())
         gray = F.avg_pool2d(gray, 2)
     return found
 
 
-class _Filtered(torch.autograd.Function):
-    """Correlation with the filters, and its transpose as one more: autograd's own takes a CPU nearly twice as long."""
+def _placed(filters: Tensor) -> Tensor:
+    """[2 ORIENTATIONS * STRIDE^2, PATCH^2]: every filter at every place of a block, as rows to multiply a patch by."""
+    placed = filters.new_zeros((len(filters), STRIDE, STRIDE, PATCH, PATCH))
+    for down in range(STRIDE):
+        for right in range(STRIDE):
+            placed[:, down, right, down : down + SIZE, right : right + SIZE] = filters[:, 0]
+    return placed.view(-1, PATCH**2)
+
+
+class _GreatestSquares(torch.autograd.Function):
+    """Gray levels [h,w] -> [ORIENTATIONS,rows,columns], the greatest squared energy in each block of STRIDE^2 places.
+
+    One product of matrices for all places of a block: a convolution of a single channel takes a CPU three times as
+    long, and its transpose seven times. The first of equal energies, row by row of the block, has the gradient.
+    """
 
     @staticmethod
-    def forward(ctx: Any, gray: Tensor, filters: Tensor) -> Tensor:
-        ctx.save_for_backward(filters)
-        return F.conv2d(gray, filters)
+    def forward(ctx: Any, gray: Tensor, matrix: Tensor) -> Tensor:
+        patches = gray.unfold(0, PATCH, STRIDE).unfold(1, PATCH, STRIDE)
+        rows, columns = patches.shape[:2]
+        responses = (matrix @ patches.reshape(-1, PATCH**2).T).view(2, ORIENTATIONS, STRIDE**2, -1)
+        squares = responses[0].square().addcmul_(responses[1], responses[1])
+        if not ctx.needs_input_grad[0]:
+            return squares.amax(1).view(ORIENTATIONS, rows, columns)
+        greatest, place = squares.max(1, keepdim=True)
+        place = place.expand(2, -1, -1, -1)
+        ctx.save_for_backward(matrix, responses.gather(2, place), place)
+        ctx.size = gray.shape
+        return greatest.view(ORIENTATIONS, rows, columns)
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> tuple[Tensor, None]:
-        (filters,) = ctx.saved_tensors
-        return F.conv2d(grads[0], filters.flip(2, 3).transpose(0, 1), padding=SIZE - 1), None
+        matrix, responses, place = ctx.saved_tensors
+        pull = 2 * responses * grads[0].reshape(ORIENTATIONS, 1, -1)
+        pulls = pull.new_zeros((2, ORIENTATIONS, STRIDE**2, pull.shape[-1])).scatter_(2, place, pull)
+        patches = matrix.T @ pulls.view(len(matrix), -1)
+        return F.fold(patches, ctx.size, PATCH, stride=STRIDE)[0], None

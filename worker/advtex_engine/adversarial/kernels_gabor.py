@@ -170,8 +170,9 @@ def distances(
 
     grays: [2,PIXELS] float32. filters: [2,ORIENTATIONS,SIZE,SIZE] float32. squares: [2,ORIENTATIONS,PIXELS] float32, of
     `energies`. Written: sums [number of programs] float32, whose total is the loss; places [ORIENTATIONS,WINDOWS]
-    int32, where in the window, row by row, the render's energy is greatest, the first of such places; pulls
-    [2,ORIENTATIONS,WINDOWS] float32, the loss's gradient of the responses there to the even and the odd filter.
+    int32, where in the window, counted row by row, the render's energy is greatest, of such places the first of the
+    first block of STRIDE x STRIDE; pulls [2,ORIENTATIONS,WINDOWS] float32, the loss's gradient of the responses there
+    to the even and the odd filter.
     """
     window = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     octave, column, row = place_of_window(window, HEIGHT, WIDTH, OCTAVES)
@@ -182,13 +183,16 @@ def distances(
     live = there & (window < WINDOWS)[None, :]
     best, theirs = tl.zeros((PADDED, BLOCK), tl.float32) - 1.0, tl.zeros((PADDED, BLOCK), tl.float32)
     place = tl.zeros((PADDED, BLOCK), tl.int32)
-    for down in range(WINDOW):
-        for right in tl.static_range(WINDOW):
-            at = squares + orientation * PIXELS + (corner + down * width + right)[None, :]
-            value = tl.load(at, mask=live, other=0.0)
-            place = tl.where(value > best, down * WINDOW + right, place)
-            best = tl.maximum(best, value)
-            theirs = tl.maximum(theirs, tl.load(at + ORIENTATIONS * PIXELS, mask=live, other=0.0))
+    for top in range(0, WINDOW, STRIDE):
+        for left in range(0, WINDOW, STRIDE):
+            for below in range(STRIDE):
+                for beside in tl.static_range(STRIDE):
+                    down, right = top + below, left + beside
+                    at = squares + orientation * PIXELS + (corner + down * width + right)[None, :]
+                    value = tl.load(at, mask=live, other=0.0)
+                    place = tl.where(value > best, down * WINDOW + right, place)
+                    best = tl.maximum(best, value)
+                    theirs = tl.maximum(theirs, tl.load(at + ORIENTATIONS * PIXELS, mask=live, other=0.0))
     even, odd = tl.zeros((PADDED, BLOCK), tl.float32), tl.zeros((PADDED, BLOCK), tl.float32)
     at = grays + corner[None, :] + place // WINDOW * width[None, :] + place % WINDOW
     for down in range(SIZE):

@@ -16,8 +16,10 @@ import dataclasses
 import itertools
 import tempfile
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from harness import (
@@ -52,16 +54,19 @@ from advtex_engine.runtime.devices import choose_device
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """A method, whether cameras and exposures are refined, and what differs from its preset."""
+    """A method, whether cameras are refined, and what differs from its preset and from the engine's code."""
 
     method: str = "adversarial"
     refine: bool = True
     changes: dict[str, Any] = dataclasses.field(default_factory=dict)
+    code: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
+SELECTION = "advtex_engine.selection"
 VARIANTS = {
     "mean": Variant("mean"),
     "view selection": Variant("view_selection"),
+    "view selection without regional blur": Variant("view_selection", code={f"{SELECTION}.detail.WEIGHT": 0.0}),
     "the whole": Variant(),
     "without refined cameras": Variant(refine=False),
     "without refined cameras and without alignment": Variant(refine=False, changes={"alignment": False}),
@@ -149,7 +154,10 @@ def textures(
         preset = dataclasses.replace(resolve_preset(changed, device.type), **variant.changes)
         given = dataclasses.replace(inputs[variant.refine], config=changed, preset=preset)
         watch = Stopwatch()
-        texture = run_method(given, variant.method)
+        with ExitStack() as stack:
+            for place, changed_value in variant.code.items():
+                stack.enter_context(patch(place, changed_value))
+            texture = run_method(given, variant.method)
         yield name, given, texture, watch.seconds
 
 

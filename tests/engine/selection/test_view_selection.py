@@ -15,6 +15,7 @@ from advtex_engine.core.config import PRESETS, TextureConfig
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Atlas, Camera, Mesh, Scene, View
 from advtex_engine.methods import MethodInput, texture_function
+from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.view_selection import Selection, select_views, view_selection
 from advtex_engine.metrics.image_metrics import gradient_ratio
 from advtex_engine.pipeline import texture_scan
@@ -69,7 +70,8 @@ def given(tmp_path: Path, views: list[View], atlas: Atlas | None = None) -> Meth
     maps = {1: build_view_maps(atlas, scene.views, scene.kind)}
     monitor = Monitor()
     work, live = WorkFolder(tmp_path / "work", "test", monitor), Live(scene, atlas, monitor)
-    return MethodInput(scene, atlas, maps, {}, PRESETS["standard"], TextureConfig(), monitor, work, live)
+    means = {1: mean_texture(maps[1])}
+    return MethodInput(scene, atlas, maps, means, PRESETS["standard"], TextureConfig(), monitor, work, live)
 
 
 def good_views(atlas: Atlas) -> list[View]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from advtex_engine.render.texture import fill_holes
 from advtex_engine.render.view_maps import DEPTH_TOLERANCE
 from advtex_engine.selection.back_projection import back_project
 from advtex_engine.selection.candidates import OCCLUSION_SHARE, find_candidates
+from advtex_engine.selection.detail import blur_cost
 from advtex_engine.selection.leveling import Sampler, blend_texels
 from advtex_engine.selection.mrf import assign_views
 
@@ -47,6 +48,7 @@ def select_views(given: MethodInput) -> Selection:
     # What is hidden by less than this counts as seen.
     tolerance = DEPTH_TOLERANCE[given.scene.kind] * OCCLUSION_SHARE
     candidates = find_candidates(mesh, maps, tolerance)
+    candidates = replace(candidates, cost=candidates.cost + blur_cost(mesh, candidates, maps, given.means[1]))
     assignment = assign_views(mesh.t_pos_idx, candidates)
     texels = map_texels(atlas)
     blend = blend_texels(mesh, texels, assignment.view, candidates.view, Sampler(maps, tolerance))

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from advtex_engine.metrics.image_metrics import eroded, gradient_magnitude, luminance
 from advtex_engine.refine.exposure import BRIGHT, DARK
+from advtex_engine.render.filtering import blurred, separable
 
 BANDS = 3
 BAND_SIGMA = 1.2
@@ -154,22 +155,7 @@ def flat_pixels(truth: Tensor, mask: Tensor) -> Tensor:
     return eroded(mask, radius) & (square < FLAT_GRADIENT**2) & clear
 
 
-def blurred(planes: Tensor, sigma: float) -> Tensor:
-    """Planes [N,H,W] under a Gaussian of standard deviation `sigma` in pixels; borders are mirrored."""
-    radius = math.ceil(4 * sigma)
-    offset = torch.arange(-radius, radius + 1, dtype=torch.float32, device=planes.device)
-    kernel = torch.exp(-offset.square() / (2 * sigma**2))
-    return _separable(planes, kernel / kernel.sum())
-
-
 def _halved(planes: Tensor) -> Tensor:
     """The next level of the Gaussian pyramid (Burt & Adelson 1983): [N,H,W] -> [N,(H+1)//2,(W+1)//2]."""
     kernel = planes.new_tensor([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
-    return _separable(planes, kernel)[:, ::2, ::2]
-
-
-def _separable(planes: Tensor, kernel: Tensor) -> Tensor:
-    radius = len(kernel) // 2
-    padded = F.pad(planes[:, None], (radius,) * 4, mode="reflect")
-    rows = F.conv2d(padded, kernel.view(1, 1, 1, -1))
-    return F.conv2d(rows, kernel.view(1, 1, -1, 1))[:, 0]
+    return separable(planes, kernel)[:, ::2, ::2]

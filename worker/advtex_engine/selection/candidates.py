@@ -7,7 +7,8 @@ the others are marked down.
 
 The data term is a sum of logarithms, each the factor by which another view of the same face is better:
 resolution (square root of the projected area), frontality, the right side, sharpness of the frame, distance from depth
-discontinuities and from the image's border, and agreement in color with the face's other candidates.
+discontinuities and from the image's border, and agreement in color with the face's other candidates. `detail.py` adds
+what a frame is blurred by in one region and not in another.
 """
 
 from __future__ import annotations
@@ -149,7 +150,7 @@ def _look(
     kept: Candidates,
 ) -> None:
     """Puts a view into the places of worse ones, for the faces that it sees. front: as `front_side` says."""
-    pixel, depth = _project(points.position, maps, view)
+    pixel, depth = project_points(points.position, maps, view)
     inside = (depth > MIN_DEPTH) & (pixel > 0.5).all(1)
     inside &= (pixel[:, 0] < maps.width - 0.5) & (pixel[:, 1] < maps.height - 0.5)
     face = inside[points.index[:, :3]].all(1).nonzero()[:, 0]
@@ -176,7 +177,7 @@ def _look(
     kept.color[face, place] = color[index[better]]
 
 
-def _project(position: Tensor, maps: ViewMaps, view: int) -> tuple[Tensor, Tensor]:
+def project_points(position: Tensor, maps: ViewMaps, view: int) -> tuple[Tensor, Tensor]:
     """Pixels [P,2] and depth [P] of world points."""
     pose = maps.world_to_camera[view].to(position)
     seen = position @ pose[:3, :3].T + pose[:3, 3]

@@ -1,0 +1,25 @@
+"""Low-passes of images: every channel by itself, borders mirrored."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+def blurred(planes: Tensor, sigma: float) -> Tensor:
+    """Planes [N,H,W] under a Gaussian of standard deviation `sigma` in pixels; H, W above 4 sigma."""
+    radius = math.ceil(4 * sigma)
+    offset = torch.arange(-radius, radius + 1, dtype=torch.float32, device=planes.device)
+    kernel = torch.exp(-offset.square() / (2 * sigma**2))
+    return separable(planes, kernel / kernel.sum())
+
+
+def separable(planes: Tensor, kernel: Tensor) -> Tensor:
+    """Planes [N,H,W] under the same kernel [2R+1] across and down."""
+    radius = len(kernel) // 2
+    padded = F.pad(planes[:, None], (radius,) * 4, mode="reflect")
+    rows = F.conv2d(padded, kernel.view(1, 1, 1, -1))
+    return F.conv2d(rows, kernel.view(1, 1, -1, 1))[:, 0]

@@ -1,6 +1,6 @@
 """What each part is worth: the whole, and the whole with one part switched off.
 
-    python tests/benchmarks/parts.py [SCAN …] [--models 2] [--steps 1000]
+    python tests/benchmarks/parts.py [SCAN …] [--models 2] [--steps 1000] [--variants NAME …]
 
 On synthetic scans with known truth, `default` with the errors that real ones have (`advtex_engine.synthetic.scan`) and
 `geometry` with larger ones of the mesh alone, and on scans of one's own against every 8th frame, held out. Writes
@@ -83,6 +83,7 @@ def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("scans", nargs="*", type=Path, help="folders or zip files")
     parser.add_argument("--synthetic", nargs="*", default=list(SCANS), choices=SCANS)
     parser.add_argument("--models", type=int, default=2, help="objects, with other prints each")
+    parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=VARIANTS, metavar="NAME")
     parsed: argparse.Namespace = parser.parse_args(line)
     return parsed
 
@@ -104,8 +105,8 @@ def fill(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
     device = choose_device(arguments.device)
     config = configuration(arguments, "adversarial")
     for synthetic, model in itertools.product(arguments.synthetic, range(arguments.models)):
-        settings = {name: settings_of(arguments, synthetic, model, name) for name in VARIANTS}
-        missing = [name for name in VARIANTS if results.find(settings[name]) is None]
+        settings = {name: settings_of(arguments, synthetic, model, name) for name in arguments.variants}
+        missing = [name for name in arguments.variants if results.find(settings[name]) is None]
         if not missing:
             continue
         with tempfile.TemporaryDirectory(prefix="advtex-parts-") as folder:
@@ -125,7 +126,7 @@ def fill_scans(arguments: argparse.Namespace, results: Results) -> None:
     """The same on real scans, whose frames are scored against the model that was written."""
     device = choose_device(arguments.device)
     for scan in arguments.scans:
-        missing = [name for name in VARIANTS if results.find(scan_settings_of(arguments, scan, name)) is None]
+        missing = [name for name in arguments.variants if results.find(scan_settings_of(arguments, scan, name)) is None]
         config = TextureConfig(
             preset=arguments.preset,
             size=parsed_size(arguments.size),

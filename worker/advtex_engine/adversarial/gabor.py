@@ -64,7 +64,9 @@ def gabor_loss(render: Tensor, photograph: Tensor, foreground: Tensor, filters: 
 
 def _gray(image: Tensor) -> Tensor:
     """[1,3,h,w] in [-1,1] -> [1,h,w], with differences as of colors in [0,1]."""
-    return image.permute(0, 2, 3, 1) @ image.new_tensor([part / 2 for part in LUMA])
+    # Filled on the device: a list of numbers would have to be copied there, which a captured step must not do.
+    weights = torch.cat([image.new_full((1,), part / 2) for part in LUMA])
+    return image.permute(0, 2, 3, 1) @ weights
 
 
 def _shares(gray: Tensor, matrix: Tensor) -> list[Tensor]:

@@ -15,7 +15,7 @@ from advtex_engine.methods.mean import mean_texture
 from advtex_engine.render.render_view import render_view
 from advtex_engine.render.view_maps import build_view_maps
 from advtex_engine.selection.candidates import NO_VIEW, Candidates, find_candidates
-from advtex_engine.selection.detail import MOST, blur_cost, relative_detail
+from advtex_engine.selection.detail import MOST, blur_cost, compare_detail
 
 SIDE, CELLS = 160, 12
 WIDTH, HEIGHT = 160, 128
@@ -126,8 +126,27 @@ def test_the_ratio_is_that_of_the_amplitudes(atlas: Atlas) -> None:
     """But for grain, which counts as detail on both sides: faint print is a little less far off."""
     strong, faint = printed(0.6), printed(0.3)
     maps = build_view_maps(atlas, tuple(photographs(atlas, strong, PLACES[NEAR:])), "object")
-    beside_strong, beside_faint = (relative_detail(maps, texture, 0) for texture in (strong, faint))
+    (beside_strong, same), (beside_faint, fainter) = (compare_detail(maps, texture, 0) for texture in (strong, faint))
     inner = (slice(10, -10), slice(12, -12))
     assert float(beside_strong[inner].abs().median()) < 0.1, "but for what sampling a texture softens"
     assert math.log(2) - 0.2 < float(beside_faint[inner].median()) < math.log(2)
     assert float(beside_faint.abs().max()) <= MOST
+    assert min(float(same[inner].min()), float(fainter[inner].min())) > 0.9, "contrast is no matter of likeness"
+
+
+def test_another_print_is_not_alike(atlas: Atlas) -> None:
+    maps = build_view_maps(atlas, tuple(photographs(atlas, printed(), PLACES[NEAR:])), "object")
+    likeness = compare_detail(maps, printed().flip(0), 0)[1]
+    assert abs(float(likeness[10:-10, 12:-12].mean())) < 0.2
+    assert float(likeness.abs().max()) <= 1 + 1e-4
+
+
+def test_where_views_show_different_things_less_detail_is_no_blur(atlas: Atlas) -> None:
+    """Cameras that are off: each photograph shows another piece of print, one of them smeared."""
+    views = photographs(atlas, printed(), PLACES)
+    views[NEAR] = replace(views[NEAR], color=smeared(views[NEAR].color))
+    right = costs(atlas, views)
+    wrong = [replace(view, color=view.color.roll((23 * i, 31 * i), (0, 1))) for i, view in enumerate(views)]
+    off = costs(atlas, wrong)
+    shares = [float(of_view(cost, candidates, NEAR).nanmean()) for candidates, cost in (off, right)]
+    assert shares[0] < 0.4 * shares[1], "five views: a fifth of the mean is each one itself"

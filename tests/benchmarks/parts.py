@@ -15,8 +15,8 @@ import argparse
 import dataclasses
 import itertools
 import tempfile
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -54,19 +54,41 @@ from advtex_engine.runtime.devices import choose_device
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """A method, whether cameras are refined, and what differs from its preset and from the engine's code."""
+    """A method, whether cameras are refined, and what differs from its preset and from the engine's code.
+
+    prepared: in the code while the scan is prepared. code: in that of the method.
+    """
 
     method: str = "adversarial"
     refine: bool = True
     changes: dict[str, Any] = dataclasses.field(default_factory=dict)
+    prepared: dict[str, Any] = dataclasses.field(default_factory=dict)
     code: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
-SELECTION = "advtex_engine.selection"
+def _one_exposure(samples: Tensor, *_: object) -> tuple[Tensor, Tensor]:
+    """Gain and offset [V,3] that change nothing."""
+    ones = samples.new_ones((len(samples), 3))
+    return ones, torch.zeros_like(ones)
+
+
+SELECTION, REFINE = "advtex_engine.selection", "advtex_engine.refine"
 VARIANTS = {
     "mean": Variant("mean"),
     "view selection": Variant("view_selection"),
     "view selection without regional blur": Variant("view_selection", code={f"{SELECTION}.detail.WEIGHT": 0.0}),
+    "view selection without agreement": Variant(
+        "view_selection", code={f"{SELECTION}.candidates.AGREEMENT_WEIGHT": 0.0}
+    ),
+    "view selection without back-projection": Variant(
+        "view_selection", code={"advtex_engine.methods.view_selection.back_project": lambda color, *_: color}
+    ),
+    "view selection without exposures": Variant(
+        "view_selection", prepared={f"{REFINE}.run.fit_exposure": _one_exposure}
+    ),
+    "view selection without refined geometry": Variant("view_selection", prepared={f"{REFINE}.run.ROUNDS": 0}),
+    "view selection without refinement": Variant("view_selection", refine=False),
+    "gabor": Variant("gabor"),
     "the whole": Variant(),
     "without refined cameras": Variant(refine=False),
     "without refined cameras and without alignment": Variant(refine=False, changes={"alignment": False}),
@@ -114,9 +136,10 @@ def fill(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
             make_named_scan(scan, synthetic, views=arguments.views, size=arguments.size, seed=model)
             truth = load_truth(scan)
             shown: dict[str, Tensor] = {}
-            for name, given, texture, seconds in textures(missing, scan, config, work, device):
+            for name, given, texture, times in textures(missing, scan, config, work, device):
                 shown[name] = picture(given.atlas, texture, truth)
-                results.add(settings[name], score_texture(given.atlas, texture, truth, lpips), seconds)
+                scores = score_texture(given.atlas, texture, truth, lpips)
+                results.add(settings[name], {**scores, "prepared": times[0]}, times[1])
             if set(SHOWN) <= shown.keys():
                 path = arguments.results / f"{synthetic}_{model}.png"
                 draw(path, scan, truth, {name: shown[name] for name in SHOWN})
@@ -136,30 +159,44 @@ def fill_scans(arguments: argparse.Namespace, results: Results) -> None:
             device=arguments.device,
         )
         with tempfile.TemporaryDirectory(prefix="advtex-parts-") as folder:
-            for name, given, texture, seconds in textures(missing, scan, config, Path(folder), device):
+            for name, given, texture, times in textures(missing, scan, config, Path(folder), device):
                 kept = arguments.results / scan.stem / name.replace(" ", "_")
                 scores = score_model(given, texture, scan, kept, None, arguments.lpips_weights)
-                results.add(scan_settings_of(arguments, scan, name), scores, seconds)
+                results.add(scan_settings_of(arguments, scan, name), {**scores, "prepared": times[0]}, times[1])
 
 
 def textures(
     variants: list[str], scan: Path, config: TextureConfig, work: Path, device: torch.device
-) -> Iterator[tuple[str, MethodInput, Tensor, float]]:
-    """Per variant what its method was given, the texture [H,W,3] and the seconds that it took."""
-    inputs: dict[bool, MethodInput] = {}
+) -> Iterator[tuple[str, MethodInput, Tensor, tuple[float, float]]]:
+    """Per variant what its method was given, the texture [H,W,3], and the seconds of the preparation and the method.
+
+    What several variants share is prepared once.
+    """
+    inputs: dict[object, tuple[MethodInput, float]] = {}
     for name in variants:
         variant = VARIANTS[name]
         changed = dataclasses.replace(config, method=variant.method, refine=variant.refine)
-        if variant.refine not in inputs:
-            inputs[variant.refine] = prepare(scan, changed, work, device)
+        shared = (variant.refine, *variant.prepared.items())
+        if shared not in inputs:
+            watch = Stopwatch()
+            with patched(variant.prepared):
+                inputs[shared] = prepare(scan, changed, work, device), watch.seconds
+        given, before = inputs[shared]
         preset = dataclasses.replace(resolve_preset(changed, device.type), **variant.changes)
-        given = dataclasses.replace(inputs[variant.refine], config=changed, preset=preset)
+        given = dataclasses.replace(given, config=changed, preset=preset)
         watch = Stopwatch()
-        with ExitStack() as stack:
-            for place, changed_value in variant.code.items():
-                stack.enter_context(patch(place, changed_value))
+        with patched(variant.code):
             texture = run_method(given, variant.method)
-        yield name, given, texture, watch.seconds
+        yield name, given, texture, (before, watch.seconds)
+
+
+@contextmanager
+def patched(code: Mapping[str, Any]) -> Iterator[None]:
+    """Other values at places of the engine's code, for as long as the block lasts."""
+    with ExitStack() as stack:
+        for place, value in code.items():
+            stack.enter_context(patch(place, value))
+        yield
 
 
 def report(arguments: argparse.Namespace, results: Results) -> None:
@@ -180,9 +217,10 @@ def report(arguments: argparse.Namespace, results: Results) -> None:
         for name, line in zip(VARIANTS, lines, strict=True):
             if cells := [cell for cell in line if cell is not None]:
                 seconds = sum(cell["seconds"] for cell in cells) / len(cells)
-                rows.append([name, *(shown_mean(cells, score) for score in scores), seconds])
+                rows.append([name, *(shown_mean(cells, score) for score in (*scores, "prepared")), seconds])
                 found += cells
-        body += f"\n## {title}\n\n{markdown_table(['variant', *scores.values(), 'seconds'], rows)}"
+        head = ["variant", *scores.values(), "seconds before", "seconds"]
+        body += f"\n## {title}\n\n{markdown_table(head, rows)}"
     over_scans = {
         name: [results.find(scan_settings_of(arguments, scan, name)) for scan in arguments.scans] for name in VARIANTS
     }

@@ -166,12 +166,20 @@ def test_a_benchmark_without_weights_ends_with_one_sentence(tmp_path: Path) -> N
         sparsity.main([*SMALL, "--lpips-weights", str(tmp_path), "--results", str(tmp_path)])
 
 
+def test_parts_switch_off_what_is_there() -> None:
+    for variant in parts.VARIANTS.values():
+        with parts.patched(variant.prepared), parts.patched(variant.code):
+            pass
+    with pytest.raises(AttributeError), parts.patched({"advtex_engine.refine.run.NO_SUCH_NAME": 0}):
+        pass
+
+
 @pytest.mark.slow
 def test_each_part_is_switched_off_once(tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     synthesize(tmp_path / "desk", views=6, width=64, height=64)
     monkeypatch.setattr(parts, "HOLDOUT", 3)
     monkeypatch.setattr(parts, "SCAN_FACES", 600)
-    some = (*parts.SHOWN, "without refined cameras")
+    some = (*parts.SHOWN, "view selection without refined geometry", "without refined cameras")
     monkeypatch.setattr(parts, "VARIANTS", {name: parts.VARIANTS[name] for name in some})
     line = [str(tmp_path / "desk"), *SMALL, "--models", "1", "--lpips-weights", str(weights)]
     line += ["--results", str(tmp_path)]

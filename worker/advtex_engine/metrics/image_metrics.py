@@ -166,7 +166,9 @@ def score_views(renders: Iterable[Tensor], photos: Iterable[Tensor], masks: Iter
 def eroded(mask: Tensor, radius: int) -> Tensor:
     """Pixels [H,W] bool whose whole (2 radius + 1)^2 neighborhood lies inside the image and the mask."""
     outside = F.pad((~mask).to(torch.float32), (radius,) * 4, value=1.0)
-    return F.max_pool2d(outside[None, None], 2 * radius + 1, stride=1)[0, 0] == 0
+    side = 2 * radius + 1
+    across = F.max_pool2d(outside[None], (1, side), stride=1)
+    return F.max_pool2d(across, (side, 1), stride=1)[0] == 0
 
 
 def _check(image: Tensor, truth: Tensor, mask: Tensor) -> None:
@@ -210,6 +212,5 @@ def _patch_corners(image: Tensor, mask: Tensor | None, most: int | None = None, 
 def _patches(image: Tensor, corners: Tensor) -> Tensor:
     """The 7x7 patches whose first pixels are `corners` [N] (flat indices), as [N,147] in levels of 0 to 255."""
     steps = torch.arange(PATCH, device=image.device)
-    offsets = (steps[:, None] * image.shape[1] + steps).flatten()
-    flat = image.reshape(-1, 3).to(torch.float32) * 255
-    return flat[corners[:, None] + offsets].flatten(1)
+    rows = (image.to(torch.float32) * 255).reshape(-1).unfold(0, PATCH * 3, 3)  # seven pixels each
+    return rows[corners[:, None] + steps * image.shape[1]].flatten(1)

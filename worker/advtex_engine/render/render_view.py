@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,11 +11,13 @@ from torch import Tensor
 
 from advtex_engine.core.cameras import scaled_camera
 from advtex_engine.core.scene import Atlas, Camera
-from advtex_engine.render.rasterize import rasterize_views
+from advtex_engine.render.rasterize import rasterize
 from advtex_engine.render.texture import sample_image
 
 BACKGROUND = 0.8
 """Gray level of pixels that show no surface."""
+RENDER_BYTES, BYTES_PER_SAMPLE = 1 << 30, 100
+"""What pictures take that are rendered at once; 97 bytes were seen."""
 
 
 def render_view(
@@ -58,24 +60,25 @@ class GBuffer:
 
 def gbuffer(atlas: Atlas, camera: Camera, supersample: int = 2) -> GBuffer:
     """What `camera` sees of the model at supersample x supersample points per pixel."""
-    return next(gbuffers(atlas, [camera], supersample))
-
-
-def gbuffers(atlas: Atlas, cameras: Sequence[Camera], supersample: int = 2) -> Iterator[GBuffer]:
-    """`gbuffer` for each camera in turn; the same result, with the work on the mesh done once."""
     assert supersample >= 1
     mesh = atlas.mesh
     assert mesh.v_uv is not None
     assert mesh.t_uv_idx is not None
-    fine = [scaled_camera(camera, camera.width * supersample, camera.height * supersample) for camera in cameras]
-    for camera, fragments in zip(cameras, rasterize_views(mesh, fine), strict=True):
-        faces = fragments.face_index.flatten()
-        hit = (faces >= 0).nonzero()[:, 0]
-        corners = mesh.t_uv_idx.index_select(0, faces.index_select(0, hit))
-        weights = fragments.barycentric.view(-1, 3).index_select(0, hit)
-        # The mean of three corners weighted by the barycentrics.
-        uv = F.embedding_bag(corners, mesh.v_uv, per_sample_weights=weights, mode="sum")
-        yield GBuffer(hit, uv, camera.width, camera.height, supersample)
+    fine = scaled_camera(camera, camera.width * supersample, camera.height * supersample)
+    fragments = rasterize(mesh, fine)
+    faces = fragments.face_index.flatten()
+    hit = (faces >= 0).nonzero()[:, 0]
+    corners = mesh.t_uv_idx.index_select(0, faces.index_select(0, hit))
+    weights = fragments.barycentric.view(-1, 3).index_select(0, hit)
+    # The mean of three corners weighted by the barycentrics.
+    uv = F.embedding_bag(corners, mesh.v_uv, per_sample_weights=weights, mode="sum")
+    return GBuffer(hit, uv, camera.width, camera.height, supersample)
+
+
+def renders_at_once(cameras: Sequence[Camera], threads: int, supersample: int = 2) -> int:
+    """How many of them may be looked through at once, in as many threads, without taking more than RENDER_BYTES."""
+    pixels = max((camera.width * camera.height for camera in cameras), default=1)
+    return max(1, min(threads, RENDER_BYTES // (BYTES_PER_SAMPLE * supersample**2 * pixels)))
 
 
 def shade(buffer: GBuffer, texture: Tensor, background: float = BACKGROUND) -> Tensor:

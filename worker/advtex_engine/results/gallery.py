@@ -16,9 +16,9 @@ manifest.json                lists all but the first two and the stream; its pat
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -26,10 +26,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from advtex_engine.core.scene import Atlas, Scene, View, evenly_spread
-from advtex_engine.previews.turntable import SIZE, Circle, circle_cameras, facing, find_circle, turntable
+from advtex_engine.core.scene import Atlas, Camera, Scene, View, evenly_spread
+from advtex_engine.previews.turntable import SIZE, Circle, circle_cameras, facing, find_circle
 from advtex_engine.render.pictures import contact_sheet, encode_jpeg, side_by_side, to_bytes
-from advtex_engine.render.render_view import GBuffer, gbuffer, gbuffers, shade
+from advtex_engine.render.render_view import GBuffer, gbuffer, renders_at_once, shade
 from advtex_engine.results.initial_view import orbit
 from advtex_engine.results.photographs import photograph_stream
 from advtex_engine.results.seen import marks, tinted
@@ -46,6 +46,8 @@ TURNTABLE_TEXTURE = 1024
 """Texels of the texture that pictures of the whole model are painted with: finer ones would flicker in them."""
 
 Image = NDArray[np.uint8]
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 def write_gallery(
@@ -61,11 +63,12 @@ def write_gallery(
 
     texture, mean: [atlas.height,atlas.width,3] float sRGB in [0,1] on the device of the atlas's mesh, which renders.
     curves: see `curves.py`. state: [H,W] uint8 of `coverage`, for the pictures `_seen`; None: there are none of these.
-    Pictures are encoded and written in a few threads while the next ones are rendered.
+    Pictures are rendered, encoded and written in a few threads.
     """
+    threads = torch.get_num_threads() if texture.device.type == "cpu" else 1
     with one_thread_each():
         marked = None if state is None else marks(state)
-        return _write_pictures(_Gallery(out, marked), scene, atlas, texture, mean, curves)
+        return _write_pictures(_Gallery(out, marked, threads), scene, atlas, texture, mean, curves)
 
 
 def _write_pictures(
@@ -78,15 +81,18 @@ def _write_pictures(
     coarse = _coarse(texture)
     # Textures made of smaller pictures than the turntable's have no detail that finer samples would show.
     supersample = 2 if scene.views[0].camera.width >= SIZE[0] else 1
-    buffers = enumerate(turntable(atlas, circle, supersample))
-    gallery.turntable = gallery.save_all(
-        picture
-        for frame, buffer in buffers
-        for picture in gallery.both(f"turntable/{frame:02d}", buffer, shade(buffer, coarse))
-    )
+
+    def frame(numbered: tuple[int, Camera]) -> list[tuple[str, Image]]:
+        number, camera = numbered
+        buffer = gbuffer(facing(atlas, camera, circle.outer), camera, supersample)
+        return list(gallery.both(f"turntable/{number:02d}", buffer, shade(buffer, coarse)))
+
+    cameras = circle_cameras(circle)
+    frames = gallery.rendered(frame, list(enumerate(cameras)), cameras)
+    gallery.turntable = gallery.save_all(picture for pictures in frames for picture in pictures)
     atlases = gallery.save_all(_atlas_pictures(gallery, texture, atlas.pages))
     (thumbnail,) = gallery.save_all([("thumbnail.jpg", _thumbnail(atlas, circle, coarse, renders))])
-    entries, stream = photograph_stream(scene, atlas, texture)
+    entries, stream = photograph_stream(scene, atlas, texture, gallery.threads)
     photographs = {"stream": gallery.write("photographs.mjpeg", stream), "views": entries}
     step = 1 if gallery.marked is None else 2
     manifest: dict[str, Any] = {
@@ -115,11 +121,12 @@ def chosen_views(scene: Scene) -> list[tuple[View, bool]]:
 class _Gallery:
     """The files written so far, and the manifest's lists.
 
-    marked: a texture of `marks`, for a second picture of each that shows the model; None: there are none.
+    marked: a texture of `marks`, for a second picture of each that shows the model; None: there are none. threads: in
+    which pictures are rendered.
     """
 
-    def __init__(self, out: Path, marked: Tensor | None = None) -> None:
-        self.out, self.marked = out, marked
+    def __init__(self, out: Path, marked: Tensor | None = None, threads: int = 1) -> None:
+        self.out, self.marked, self.threads = out, marked, threads
         self.folder = out / "previews"
         self.files: list[Path] = []
         self.views: list[dict[str, Any]] = []
@@ -130,6 +137,10 @@ class _Gallery:
         yield f"{name}.jpg", to_bytes(picture)
         if self.marked is not None:
             yield f"{name}_seen.jpg", to_bytes(tinted(picture, shade(buffer, self.marked, background=0.0)))
+
+    def rendered(self, function: Callable[[T], R], items: Iterable[T], cameras: Sequence[Camera]) -> Iterator[R]:
+        """The function of each item, in order, as many at once as there is room for pictures of the cameras."""
+        return in_threads(function, items, renders_at_once(cameras, self.threads))
 
     def save_all(self, pictures: Iterable[tuple[str, Image]]) -> list[str]:
         """Writes JPEGs. -> their paths as the manifest has them."""
@@ -171,9 +182,17 @@ def _view_pictures(
     chosen = chosen_views(scene)
     shown = evenly_spread([view for view, heldout in chosen if heldout or not scene.heldout], SHEET_VIEWS)
     rows = list[list[Tensor]]()
-    buffers = gbuffers(atlas, [view.camera for view, _ in chosen])
-    for number, ((view, heldout), buffer) in enumerate(zip(chosen, buffers, strict=True)):
+
+    def pictured(view: View) -> tuple[float, list[Tensor], Tensor | None]:
+        buffer = gbuffer(atlas, view.camera)
         pictures = [shade(buffer, candidate) for candidate in (texture, mean)]
+        if gallery.marked is None:
+            return buffer.coverage, pictures, None
+        return buffer.coverage, pictures, tinted(pictures[0], shade(buffer, gallery.marked, background=0.0))
+
+    views = [view for view, _ in chosen]
+    found = gallery.rendered(pictured, views, [view.camera for view in views])
+    for number, ((view, heldout), (coverage, pictures, seen)) in enumerate(zip(chosen, found, strict=True)):
         if any(view is other for other in shown):
             rows.append(pictures)
         images = [_reduced(image, LONGEST_SIDE) for image in (view.color.numpy(), *map(to_bytes, pictures))]
@@ -184,11 +203,10 @@ def _view_pictures(
             entry[kind] = gallery.listed(name)
             yield name, image
         gallery.views.append(entry)
-        renders.append((buffer.coverage, images[1]))
-        if gallery.marked is not None:
+        renders.append((coverage, images[1]))
+        if seen is not None:
             name = f"views/{number:04d}_seen.jpg"
             entry["seen"] = gallery.listed(name)
-            seen = tinted(pictures[0], shade(buffer, gallery.marked, background=0.0))
             yield name, _reduced(to_bytes(seen), LONGEST_SIDE)
     middle = len(shown) // 2
     rendered, averaged = rows[middle]

@@ -12,7 +12,6 @@ are those that the texture was made with. Held-out ones are among them to be com
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import cv2
@@ -24,7 +23,8 @@ from torch import Tensor
 from advtex_engine.core.cameras import camera_to_world, scaled_camera
 from advtex_engine.core.scene import TO_Y_UP, Atlas, Camera, Scene, View, evenly_spread
 from advtex_engine.render.pictures import encode_jpeg
-from advtex_engine.render.render_view import GBuffer, gbuffers, shade
+from advtex_engine.render.render_view import GBuffer, gbuffer, renders_at_once, shade
+from advtex_engine.runtime.threads import in_threads
 from advtex_engine.selection.toning import tone_difference
 from advtex_scan.matrices import from_quaternion
 
@@ -35,19 +35,26 @@ QUALITY = 90
 """60 photographs of a kitchen at 640x480 take 4 MB."""
 
 
-def photograph_stream(scene: Scene, atlas: Atlas, texture: Tensor) -> tuple[list[dict[str, Any]], bytes]:
+def photograph_stream(
+    scene: Scene, atlas: Atlas, texture: Tensor, threads: int = 1
+) -> tuple[list[dict[str, Any]], bytes]:
     """The list `views` of the JSON, and the stream.
 
-    texture: [atlas.height,atlas.width,3] float sRGB in [0,1] on the device of the atlas's mesh, which renders.
+    texture: [atlas.height,atlas.width,3] float sRGB in [0,1] on the device of the atlas's mesh, which renders, in
+    `threads` at once.
     """
     chosen = [(view, False) for view in evenly_spread(scene.views, MAX_PHOTOGRAPHS)]
     chosen += [(view, True) for view in evenly_spread(scene.heldout, MAX_HELDOUT)]
     as_glb = torch.tensor(from_quaternion(*TO_Y_UP[scene.up_axis], (0.0, 0.0, 0.0)), dtype=torch.float64)
     entries, stream = list[dict[str, Any]](), bytearray()
-    for (view, heldout), (camera, photograph) in zip(
-        chosen, _toned([v for v, _ in chosen], atlas, texture), strict=True
-    ):
-        jpeg = encode_jpeg(photograph, QUALITY)
+
+    def encoded(shown: tuple[View, Camera]) -> bytes:
+        return encode_jpeg(_toned(*shown, atlas, texture), QUALITY)
+
+    cameras = [_reduced(view.camera) for view, _ in chosen]
+    views = zip((view for view, _ in chosen), cameras, strict=True)
+    jpegs = in_threads(encoded, views, renders_at_once(cameras, threads, supersample=1))
+    for (view, heldout), camera, jpeg in zip(chosen, cameras, jpegs, strict=True):
         entries.append(
             {
                 "name": view.name,
@@ -64,15 +71,14 @@ def photograph_stream(scene: Scene, atlas: Atlas, texture: Tensor) -> tuple[list
     return entries, bytes(stream)
 
 
-def _toned(views: list[View], atlas: Atlas, texture: Tensor) -> Iterator[tuple[Camera, NDArray[np.uint8]]]:
-    """Each view's camera and color [h,w,3], no side longer than LONGEST_SIDE, in the tones of the texture."""
-    cameras = [_reduced(view.camera) for view in views]
-    for view, camera, buffer in zip(views, cameras, gbuffers(atlas, cameras, supersample=1), strict=True):
-        size = (camera.width, camera.height)
-        color = torch.from_numpy(cv2.resize(view.color.numpy(), size, interpolation=cv2.INTER_AREA)).float()
-        shown = 255 * shade(buffer, texture).cpu()
-        toned = color + tone_difference(shown - color, _seen(buffer).cpu())
-        yield camera, toned.round().clamp(0, 255).to(torch.uint8).numpy()
+def _toned(view: View, camera: Camera, atlas: Atlas, texture: Tensor) -> NDArray[np.uint8]:
+    """A view's color [h,w,3] as the reduced camera has it, in the tones of the texture."""
+    buffer = gbuffer(atlas, camera, supersample=1)
+    size = (camera.width, camera.height)
+    color = torch.from_numpy(cv2.resize(view.color.numpy(), size, interpolation=cv2.INTER_AREA)).float()
+    shown = 255 * shade(buffer, texture).cpu()
+    toned = color + tone_difference(shown - color, _seen(buffer).cpu())
+    return toned.round().clamp(0, 255).to(torch.uint8).numpy()
 
 
 def _reduced(camera: Camera) -> Camera:

@@ -146,6 +146,7 @@ SUSPECTS = {
     "from the mean, fake without holes": Row(
         preset=FROM_MEAN, code={f"{ADVERSARIAL}.operations.assemble": _fake_without_holes}
     ),
+    "half the rate": Row(preset={"lr_texture": 3e-4}),
     "an even rate": Row(preset={"lr_follows": 0.0}),
     "views as photographed": Row(preset={"toned": False}),
     "all pairs": Row(preset={"nearest_share": 1.0}),

@@ -95,7 +95,7 @@ def test_a_stopped_worker_that_wakes_up_late_commits_nothing(service: LiveServic
                 os.kill(pid, signal.SIGSTOP)
         service.start_worker("stepping")
         wait_until(lambda: client.get_job(job_id).attempt == 2)
-        for pid in tree:
+        for pid in reversed(tree):  # a parent that goes on may take leave of a child that has ended
             os.kill(pid, signal.SIGCONT)
         state = assert_done_once(service, client, job_id, STEPS)
         assert len(state["began"]) == 2

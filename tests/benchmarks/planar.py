@@ -36,6 +36,8 @@ from advtex_engine.synthetic.print import tin_side
 SIZE, SHIFT, VIEWS = 128, 8, 60
 QUERIES = 4000
 """Patches whose nearest ones are sought, of up to a quarter of a million."""
+PRINTED_NEAREST = 1.53, 7.33
+"""The paper's, section 4.1."""
 SCORES = {
     "nearest_patch": "nearest patch",
     "nearest_patch_reverse": "nearest patch, truth to texture",
@@ -169,7 +171,9 @@ def report(arguments: argparse.Namespace, results: Results) -> None:
         place = f"{told['size']}², ±{told['shift']}"
         rows.append([told["picture"], place, told["texture"], steps, *(scores[name] for name in SCORES), share])
     head = ["picture", "size", "texture", "steps", *SCORES.values(), "share of the L1 optimum's"]
-    note = "planar.png: truth, L1 optimum, with and without auxiliary views, of the newest run.\n\n"
+    note = "planar.png: truth, L1 optimum, with and without auxiliary views, of the newest run of both. "
+    note += "The paper's nearest patch, of its own picture at 512²: {} with auxiliary views, {} the L1 optimum.\n\n"
+    note = note.format(*PRINTED_NEAREST)
     write_report(arguments.results / "planar.md", "The 2D case", results.cells, note + markdown_table(head, rows))
 
 

@@ -88,8 +88,8 @@ device's queue, so that they are kernels and not launches.
 
 
 NOT_AT_HAND = """
-**No {} was at hand: these rows are empty.** What runs on one was built and tested without it: kernels
-through Triton's interpreter and compiled for sm_80 and sm_90, capture and streams by their order alone.
+**No idle {} was at hand: these rows are empty.** What runs on one is tested without it: kernels through
+Triton's interpreter and compiled for sm_80 and sm_90, capture and streams by their order alone.
 """
 
 

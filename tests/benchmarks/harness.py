@@ -132,6 +132,11 @@ def moved(mesh: Mesh, device: torch.device) -> Mesh:
     return Mesh(*(part.to(device) for part in (mesh.v_pos, mesh.t_pos_idx, mesh.v_uv, mesh.t_uv_idx)))
 
 
+def on_cpu(atlas: Atlas) -> Atlas:
+    """Where textures are that `run_method` made, and the held-out views."""
+    return dataclasses.replace(atlas, mesh=moved(atlas.mesh, torch.device("cpu")))
+
+
 def run_method(given: MethodInput, method: str) -> Tensor:
     """The method's texture [H,W,3] on the CPU, from the start: what an earlier method left behind is cleared."""
     given.work.clear()
@@ -169,7 +174,7 @@ def needed_lpips(folder: Path | None) -> Lpips:
 
 def score_texture(atlas: Atlas, texture: Tensor, truth: Truth, lpips: Lpips) -> dict[str, float]:
     """Means over the held-out views, of pixels where both the model and the true object are; NaN where none has it."""
-    atlas = dataclasses.replace(atlas, mesh=moved(atlas.mesh, torch.device("cpu")))
+    atlas = on_cpu(atlas)
     rows = []
     for camera, image, cover in zip(truth.cameras, truth.images, truth.covers, strict=True):
         render, seen = render_layers(atlas, texture, camera, supersample=SUPERSAMPLE)
@@ -188,9 +193,8 @@ def score_model(
     given: MethodInput, texture: Tensor, scan: Path, folder: Path, reference: Path | None, weights: Path | None
 ) -> dict[str, float]:
     """Means over the scan's held-out frames of the model with this texture; it is left in `folder`, with a sheet."""
-    atlas = dataclasses.replace(given.atlas, mesh=moved(given.atlas.mesh, torch.device("cpu")))
     folder.mkdir(parents=True, exist_ok=True)
-    export_model(folder, atlas, texture, up_axis=given.scene.up_axis)
+    export_model(folder, on_cpu(given.atlas), texture, up_axis=given.scene.up_axis)
     found = evaluate(
         folder / "model.obj",
         scan,
@@ -223,10 +227,15 @@ class Results:
         """The cell with exactly these settings."""
         return next((cell for cell in self.cells if cell["settings"] == settings), None)
 
-    def add(self, settings: Mapping[str, Any], scores: Mapping[str, float], seconds: float) -> None:
-        """Keeps a cell and writes the file, so that a stop loses no more than the cell in the making."""
+    def add(
+        self, settings: Mapping[str, Any], scores: Mapping[str, float], seconds: float, gpu: str | None = None
+    ) -> None:
+        """Keeps a cell and writes the file, so that a stop loses no more than the cell in the making.
+
+        gpu: the name of the one that it was run on.
+        """
         day = datetime.datetime.now(datetime.UTC).date().isoformat()
-        made = {"date": day, "command": command(), "seconds": round(seconds, 1)}
+        made = {"date": day, "command": command(), "seconds": round(seconds, 1)} | ({"gpu": gpu} if gpu else {})
         self.path.parent.mkdir(parents=True, exist_ok=True)
         folder = os.open(self.path.parent, os.O_RDONLY)
         try:
@@ -277,7 +286,7 @@ def geometric_mean(cells: Sequence[Mapping[str, Any]], name: str) -> float | str
 
 def picture(atlas: Atlas, texture: Tensor, truth: Truth) -> Tensor:
     """The texture [H,W,3] from the held-out place that is shown, [h,w,3] in [0,1]."""
-    return render_view(atlas, texture, truth.cameras[SHOWN_VIEW])
+    return render_view(on_cpu(atlas), texture, truth.cameras[SHOWN_VIEW])
 
 
 def draw(path: Path, scan: Path, truth: Truth, pictures: Mapping[str, Tensor]) -> None:

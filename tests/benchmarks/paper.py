@@ -6,7 +6,8 @@ On the study's synthetic scans (`study.py`: 256x192, 60 views) against the true 
 320x240 against every 8th frame, held out. Nothing is refined but the cameras of `colormap`, which is nothing without.
 Beside every row stand its LPIPS over that of `l1`, as in the paper's table of real scans, and its share of speckled
 texels over that of `view_selection`. `--rows suspects` changes the printed recipe, which speckles in 3D, one suspect at
-a time, and takes the preset's choices back one at a time; --steps 6000 tells them apart.
+a time, and takes the preset's choices back one at a time; --steps 6000 tells them apart. `--rows standard full` are the
+other presets as they are, refinement included.
 
 Writes paper.json (one cell per scan and row), paper.md, and a render of each, from a place that is held out, below
 --results. Stopped and run again, it goes on with the cells that are missing.
@@ -32,6 +33,7 @@ from harness import (
     load_truth,
     markdown_table,
     needed_lpips,
+    on_cpu,
     parsed_size,
     prepare,
     run_method,
@@ -45,6 +47,7 @@ from study import make_scan
 from torch import Tensor
 
 from advtex_engine.adversarial.examples import Examples, assemble
+from advtex_engine.adversarial.operations import Operations, plain_operations
 from advtex_engine.core.config import PRESETS, TextureConfig, resolve_preset
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.methods import MethodInput
@@ -82,9 +85,10 @@ PICTURES = 4
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """A method, and what differs from the preset, from the options and from the engine's code."""
+    """A method of a preset, and what differs from the preset, from the options and from the engine's code."""
 
     method: str = "adversarial"
+    named: str = "paper"
     preset: dict[str, Any] = dataclasses.field(default_factory=dict)
     options: dict[str, Any] = dataclasses.field(default_factory=dict)
     code: dict[str, Any] = dataclasses.field(default_factory=dict)
@@ -103,6 +107,7 @@ METHOD_ROWS = {
         "adversarial_no_condition",
     )
 }
+OTHER_PRESETS = {name: Row(named=name) for name in ("standard", "full")}
 
 FROM_MEAN: dict[str, Any] = {
     "start": "mean",
@@ -121,6 +126,10 @@ def _fake_without_holes(condition: Tensor, real: Tensor, fake: Tensor, *rest: An
     visible, offsets, form = rest
     whole = assemble(condition, real, fake, torch.ones_like(visible), offsets, form)
     return dataclasses.replace(assemble(condition, real, fake, *rest), fake_input=whole.fake_input)
+
+
+def _fakes_without_holes(device: torch.device) -> Operations:
+    return dataclasses.replace(plain_operations(), assemble=_fake_without_holes)
 
 
 ADVERSARIAL = "advtex_engine.adversarial"
@@ -144,9 +153,10 @@ SUSPECTS = {
         preset=FROM_MEAN, code={f"{ADVERSARIAL}.pair_sampler.DEPTH_TOLERANCE": {"object": 0.003, "scene": 0.01}}
     ),
     "from the mean, fake without holes": Row(
-        preset=FROM_MEAN, code={f"{ADVERSARIAL}.operations.assemble": _fake_without_holes}
+        preset=FROM_MEAN, code={f"{ADVERSARIAL}.optimizer.choose_operations": _fakes_without_holes}
     ),
-    "half the rate": Row(preset={"lr_texture": 3e-4}),
+    "a rate of 6e-4": Row(preset={"lr_texture": 6e-4}),
+    "a rate of 3e-4": Row(preset={"lr_texture": 3e-4}),
     "an even rate": Row(preset={"lr_follows": 0.0}),
     "views as photographed": Row(preset={"toned": False}),
     "all pairs": Row(preset={"nearest_share": 1.0}),
@@ -154,6 +164,7 @@ SUSPECTS = {
     "from zero": Row(preset={"start": "zero"}),
 }
 """One at a time from the printed recipe on, and taken back from the preset's."""
+ROWS = {**METHOD_ROWS, **OTHER_PRESETS, **SUSPECTS}
 
 
 def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
@@ -161,8 +172,8 @@ def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("scans", nargs="*", type=Path, help="folders or zip files")
     parser.add_argument("--errors", nargs="*", default=["cameras", "geometry"], choices=["cameras", "geometry"])
     parser.add_argument("--levels", nargs="+", type=float, default=[1.0, 2.75, 4.5], help="n of the error's size")
-    parser.add_argument("--rows", nargs="+", default=list(METHOD_ROWS), choices=[*METHOD_ROWS, *SUSPECTS, "suspects"])
-    parser.add_argument("--steps", type=int, default=PRESETS["paper"].steps)
+    parser.add_argument("--rows", nargs="+", default=list(METHOD_ROWS), choices=[*ROWS, "suspects"])
+    parser.add_argument("--steps", type=int, default=PRESETS["paper"].steps, help="of the preset `paper`")
     parser.add_argument("--scan-size", default=SCAN_SIZE, help="WIDTHxHEIGHT of the views of one's own scans")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--lpips-weights", type=Path, help="folder; default: $ADVTEX_LPIPS_WEIGHTS, else the cache")
@@ -175,25 +186,26 @@ def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
 
 def cells(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """The settings of every cell, scan by scan, each scan's refined cameras last."""
-    rows = sorted(arguments.rows, key=lambda name: _row(name).method == "colormap")
+    rows = sorted(arguments.rows, key=lambda name: ROWS[name].method == "colormap" or ROWS[name].named != "paper")
     study = [
         {"scan": f"{errors} {level:g}", "size": SIZE, "errors": errors, "level": level}
         for errors in arguments.errors
         for level in arguments.levels
     ]
     own = [{"scan": scan.stem, "size": arguments.scan_size} for scan in arguments.scans]
-    return [{**scan, "row": name, "steps": arguments.steps} for scan in (*study, *own) for name in rows]
+    return [{**scan, "row": name, "steps": _steps(arguments, name)} for scan in (*study, *own) for name in rows]
 
 
-def _row(name: str) -> Row:
-    return METHOD_ROWS.get(name) or SUSPECTS[name]
+def _steps(arguments: argparse.Namespace, name: str) -> int:
+    named = ROWS[name].named
+    return int(arguments.steps) if named == "paper" else PRESETS[named].steps
 
 
 def _config(arguments: argparse.Namespace, cell: dict[str, Any]) -> TextureConfig:
-    row, synthetic = _row(cell["row"]), "errors" in cell
-    steps = {"steps": arguments.steps} if row.method.startswith("adversarial") else {}
+    row, synthetic = ROWS[cell["row"]], "errors" in cell
+    steps = {"steps": cell["steps"]} if row.method.startswith("adversarial") else {}
     return TextureConfig(
-        preset="paper",
+        preset=row.named,
         method=row.method,
         size=parsed_size(cell["size"]),
         holdout=None if synthetic else HOLDOUT,
@@ -231,7 +243,7 @@ def _run(
     device: torch.device,
 ) -> None:
     """One row of one scan. inputs: what was made of the scan so far, by what it depends on."""
-    row, config = _row(cell["row"]), _config(arguments, cell)
+    row, config = ROWS[cell["row"]], _config(arguments, cell)
     key = (config.refines, *row.options.values())
     if key not in inputs:
         inputs.clear()
@@ -252,13 +264,14 @@ def _run(
         scores = score_model(given, texture, scan, work.parent / "model", None, arguments.lpips_weights)
         views = heldout_scene(scan, config, Monitor()).views
         view = views[len(views) // 2]
-    pictures = {PHOTOGRAPH: view.color / 255, cell["row"]: render_view(given.atlas, texture, view.camera)}
+    pictures = {PHOTOGRAPH: view.color / 255, cell["row"]: render_view(on_cpu(given.atlas), texture, view.camera)}
     for name, image in pictures.items():
         path = arguments.results / _picture(cell, name)
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), to_bytes(image)[..., ::-1])
     speckle = speckle_share(texture, given.maps[1].slot_map >= 0)
-    results.add(cell, scores if speckle is None else {**scores, "speckle": speckle}, seconds)
+    gpu = torch.cuda.get_device_name(device) if device.type == "cuda" else None
+    results.add(cell, scores if speckle is None else {**scores, "speckle": speckle}, seconds, gpu)
 
 
 def report(arguments: argparse.Namespace, results: Results) -> None:
@@ -300,9 +313,10 @@ def _line(cell: dict[str, Any], here: list[dict[str, Any]]) -> list[object]:
         known = [other["scores"].get(score) for other in here if other["settings"]["row"] == row]
         if known and known[0] and score in scores:
             scores[name] = scores[score] / known[0]
-    stepped = _row(settings["row"]).method.startswith("adversarial")
+    stepped = ROWS[settings["row"]].method.startswith("adversarial")
     shown = (shown_mean([{"scores": scores}], name) for name in TABLE)
-    return [settings["row"], settings["steps"] if stepped else "-", *shown, cell["seconds"]]
+    seconds = f"{cell['seconds']}, on a GPU" if "gpu" in cell else cell["seconds"]
+    return [settings["row"], settings["steps"] if stepped else "-", *shown, seconds]
 
 
 def main(line: list[str] | None = None) -> None:

@@ -79,7 +79,7 @@ def test_rows_are_added_and_gpu_rows_stay_empty_until_measured(
         in page
     )
     assert "| - | NVIDIA H200 | not measured |" in page
-    assert "No NVIDIA H200 was at hand" in page
+    assert "No idle NVIDIA H200 was at hand" in page
     assert "| view maps | 12.5 | 2 | 30 | 5 | 2.5 |" in page
     assert "(61.7 ms, 0.50 of the step above)" in page
     assert "| `conv` | 30.5 | 15 | 0.494 |" in page

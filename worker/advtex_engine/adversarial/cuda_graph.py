@@ -102,7 +102,7 @@ class Stepper:
     def _hold_back(self) -> None:
         if self._stream is None:
             return
-        end = torch.cuda.Event()  # type: ignore[no-untyped-call]
+        end = torch.cuda.Event(blocking=True)  # type: ignore[no-untyped-call]  # no core is kept busy by the wait
         end.record(torch.cuda.current_stream(self.optimizer.device))
         self._ends.append(end)
         if len(self._ends) > AHEAD:

@@ -115,7 +115,7 @@ PAPER = replace(
     # How far a texel has to go depends on how far the views disagree, by .03 on a kitchen and by .13 on an object of
     # strong colors with wrong cameras, where a rate for kitchens ends half way; what the noise of the steps costs does
     # not. A rate in proportion speckles where they disagree, an even one blurs: the root lies between.
-    lr_texture=6e-4,
+    lr_texture=4.2e-4,
     lr_unit="disagreement",
     # Steps pay while lambda holds them together. Later noise adds up, and the texture drifts from the photographs to
     # all that the discriminator has not learned to tell from them.

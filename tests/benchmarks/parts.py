@@ -72,6 +72,11 @@ def _one_exposure(samples: Tensor, *_: object) -> tuple[Tensor, Tensor]:
     return ones, torch.zeros_like(ones)
 
 
+def _pinhole(*_: object) -> tuple[None, dict[str, Any]]:
+    """No distortion, and a report of it."""
+    return None, {"corrected": False}
+
+
 SELECTION, REFINE = "advtex_engine.selection", "advtex_engine.refine"
 VARIANTS = {
     "mean": Variant("mean"),
@@ -86,6 +91,7 @@ VARIANTS = {
     "view selection without exposures": Variant(
         "view_selection", prepared={f"{REFINE}.run.fit_exposure": _one_exposure}
     ),
+    "view selection without a lens": Variant("view_selection", prepared={f"{REFINE}.run.refine_distortion": _pinhole}),
     "view selection without refined geometry": Variant("view_selection", prepared={f"{REFINE}.run.ROUNDS": 0}),
     "view selection without refinement": Variant("view_selection", refine=False),
     "gabor": Variant("gabor"),

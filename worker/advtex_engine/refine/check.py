@@ -60,6 +60,11 @@ def better(old: Tensor, new: Tensor, valid: Tensor, points: Observations, cell: 
     return bool(sure[0] & (after.sum() < MARGIN * before.sum()))
 
 
+def rounded(value: Tensor) -> float | None:
+    """For a report: four decimals; None for nan."""
+    return None if bool(value.isnan()) else round(float(value), 4)
+
+
 def _significant(gain: Tensor, counts: Tensor, cell: Tensor, errors: float) -> Tensor:
     """[N] bool: whether the mean gain [N,K] is above 0 by that many standard errors, clustered by cell [N,K].
 

@@ -76,11 +76,16 @@ def sample_points(
     z = local[..., 2].clamp(min=1e-6)
     homogeneous = local @ K.mT
     uv = (homogeneous[..., :2] / z[..., None]).float()
-    extent = uv.new_tensor(size)
-    valid = points.seen & (local[..., 2] > 1e-6) & ((uv > 1) & (uv < extent - 1)).all(-1)
-    found = F.grid_sample(features, (2 * uv / extent - 1)[:, :, None], padding_mode="border", align_corners=False)
-    value, across, down = found[..., 0].unbind(1)
-    return PointSamples(value, torch.stack((across, down), -1), uv, local.float(), valid)
+    value, gradient, inside = sample_features(features, uv, size)
+    return PointSamples(value, gradient, uv, local.float(), points.seen & (local[..., 2] > 1e-6) & inside)
+
+
+def sample_features(features: Tensor, pixel: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Value [V,K] and gradient [V,K,2] of `local_contrast` at pixels [V,K,2] of images of `size`; which are inside."""
+    extent = pixel.new_tensor(size)
+    inside = ((pixel > 1) & (pixel < extent - 1)).all(-1)
+    found = F.grid_sample(features, (2 * pixel / extent - 1)[:, :, None], padding_mode="border", align_corners=False)
+    return found[:, 0, :, 0], found[:, 1:, :, 0].mT, inside
 
 
 def refine_poses(
@@ -101,25 +106,53 @@ def refine_poses(
         for _ in range(steps):
             samples = sample_points(features, K, world_to_camera, points, size)
             residual, weight = residuals(samples.value, samples.valid, points, ROBUST_SCALE)
-            unit = _units(samples, K)
-            jacobian = pose_jacobian(samples, K) * unit[..., None]
-            strength = (jacobian.square() @ weight[..., None])[..., 0]
-            # A view without any point gets a prior alone and, its right side being 0, does not move.
-            prior = (PRIOR * strength.mean() + 1e-12).expand_as(strength).clone()
-            moved = twist(world_to_camera @ torch.linalg.inv(given)).float() / unit
-            anchor = None
-            if spread is None:
-                prior[1:] = IMMOVABLE * strength.max()
-            else:
-                held = sample_points(features, K, world_to_camera, spread, size)
-                anchor = _anchor(held, world_to_camera, unit, spread, float(strength.mean()))
-            step = solve_views(jacobian, residual, weight, points, prior, moved, anchor)
-            longest = step.norm(dim=1).clamp(min=1e-12)
-            step = step * (LARGEST_STEP * scale / longest).clamp(max=1)[:, None]
-            world_to_camera = exponential((step * unit).double()) @ world_to_camera
+            held = None if spread is None else sample_points(features, K, world_to_camera, spread, size)
+            poses = PoseSteps(samples, weight, K, given, world_to_camera, points, held, spread)
+            world_to_camera = poses.moved(poses.solve(residual), LARGEST_STEP * scale)
         if spread is not None and scale > 1:
             world_to_camera = keep_gauge(world_to_camera, given, points)
     return world_to_camera
+
+
+class PoseSteps:
+    """The Gauss-Newton step of all poses [V,4,4] from where their views see `samples`, weighted by `weight` [V,K].
+
+    held: what they see at the points of `spread`; both None: all but the first view hold the gauge.
+    """
+
+    def __init__(
+        self,
+        samples: PointSamples,
+        weight: Tensor,
+        K: Tensor,
+        given: Tensor,
+        world_to_camera: Tensor,
+        points: Observations,
+        held: PointSamples | None,
+        spread: Observations | None,
+    ) -> None:
+        self.weight, self.points, self.poses = weight, points, world_to_camera
+        self.unit = _units(samples, K)
+        self.jacobian = pose_jacobian(samples, K) * self.unit[..., None]
+        strength = (self.jacobian.square() @ weight[..., None])[..., 0]
+        # A view without any point gets a prior alone and, its right side being 0, does not move.
+        self.prior = (PRIOR * strength.mean() + 1e-12).expand_as(strength).clone()
+        self.anchor = None
+        if spread is None or held is None:
+            self.prior[1:] = IMMOVABLE * strength.max()
+        else:
+            self.anchor = _anchor(held, world_to_camera, self.unit, spread, float(strength.mean()))
+        self.off = twist(world_to_camera @ torch.linalg.inv(given)).float() / self.unit
+
+    def solve(self, residual: Tensor) -> Tensor:
+        """The step [V,6], in units of about a pixel, for residuals [V,K] to the points' means."""
+        return solve_views(self.jacobian, residual, self.weight, self.points, self.prior, self.off, self.anchor)
+
+    def moved(self, step: Tensor, most: float) -> Tensor:
+        """The poses [V,4,4] after a step [V,6], that of each view cut to `most` pixels."""
+        longest = step.norm(dim=1).clamp(min=1e-12)
+        step = step * (most / longest).clamp(max=1)[:, None]
+        return exponential((step * self.unit).double()) @ self.poses
 
 
 def _units(samples: PointSamples, K: Tensor) -> Tensor:

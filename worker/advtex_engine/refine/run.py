@@ -8,9 +8,9 @@ nothing. The same goes for the exposures.
 What is grossly wrong is put right first. Photographs that are off by tens of pixels have nothing to say to each other,
 but a depth image finds its way to the mesh (`registration`): such poses are where the rest begins.
 
-Then intrinsics and the color camera's place on the device are corrected if they are grossly wrong: held-out
-frames, which the same device has taken, get that correction too. What is off by less stays as given, since the poses
-make up for it and nothing else needs to know.
+Then what all frames share is corrected if it is grossly wrong: a lens that bends lines (`distortion`), intrinsics, and
+the color camera's place on the device. Held-out frames, which the same device has taken, get that correction too. What
+is off by less stays as given, since the poses make up for it and nothing else needs to know.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from advtex_engine.core.scene import Camera, DepthFrame, Mesh, Scene, View
 from advtex_engine.ingest.depth import depth_in_color_image
 from advtex_engine.mesh.registration import register_camera
 from advtex_engine.refine.check import better, disagreement, improved
+from advtex_engine.refine.distortion import refine_distortion, straightened
 from advtex_engine.refine.exposure import corrected_color, fit_exposure, sample_colors
 from advtex_engine.refine.geometry import refine_geometry
 from advtex_engine.refine.points import Observations
@@ -46,7 +47,8 @@ class Refinement:
 
     world_to_camera: [V,4,4] float64. gain, offset: [V,3] float32, corrected color = gain * color + offset in [0,1].
     lens [3,3] and device_offset [4,4]: the `Device` that all frames share, at their full size; None if as given. The
-    poses of training views hold the offset already. v_pos: [M,3] float32, the mesh's vertices; None if as given.
+    poses of training views hold the offset already. distortion: [2] float32, the lens's k1 and k2; None if the
+    photographs are a pinhole's. v_pos: [M,3] float32, the mesh's vertices; None if as given.
     """
 
     world_to_camera: Tensor
@@ -55,6 +57,7 @@ class Refinement:
     report: dict[str, Any]
     lens: Tensor | None = None
     device_offset: Tensor | None = None
+    distortion: Tensor | None = None
     v_pos: Tensor | None = None
 
 
@@ -79,10 +82,9 @@ def refine_scene(scene: Scene, device: torch.device, seed: int) -> Refinement:
     while len(rounds) < ROUNDS:
         refined = apply_refinement(scene, refinement)
         if rounds:
-            again = refine_cameras(refined, device, seed)
-            if again.lens is None:  # a device that would only now be found grossly wrong is not
-                refinement = replace(refinement, world_to_camera=again.world_to_camera)
-                refined = apply_refinement(scene, refinement)
+            again = refine_cameras(refined, device, seed, shared=False)
+            refinement = replace(refinement, world_to_camera=again.world_to_camera)
+            refined = apply_refinement(scene, refinement)
         geometry = refine_geometry(refined, device, seed)
         rounds.append(geometry.report)
         if geometry.v_pos is None:
@@ -91,11 +93,11 @@ def refine_scene(scene: Scene, device: torch.device, seed: int) -> Refinement:
     return replace(refinement, report={**refinement.report, "geometry": rounds})
 
 
-def refine_cameras(scene: Scene, device: torch.device, seed: int) -> Refinement:
-    """Poses, exposures and, if grossly wrong, the device, from the training views' photographs and the mesh.
+def refine_cameras(scene: Scene, device: torch.device, seed: int, shared: bool = True) -> Refinement:
+    """Poses, exposures and what all frames share, from the training views' photographs and the mesh.
 
-    Held-out views are not read. On a CPU the same input and seed give the same result. Views that share too little with
-    others keep their pose.
+    shared: a lens and a device that are grossly wrong are corrected first. Held-out views are not read. On a CPU the
+    same input and seed give the same result. Views that share too little with others keep their pose.
     """
     came = scene
     scene, by_depth = _registered(scene, device)
@@ -105,15 +107,27 @@ def refine_cameras(scene: Scene, device: torch.device, seed: int) -> Refinement:
     given = torch.stack([view.camera.world_to_camera for view in came.views]).to(working.given)
     camera = scene.views[0].camera
     scale = (camera.width / working.size[0], camera.height / working.size[1])
-    common, described = _device(working)
-    if common is not None:
-        common = common.at_scale(*scale)
-        scene = replace(scene, views=tuple(_on_device(view, common) for view in scene.views))
-        given = common.offset.to(given) @ given
-        working = working_views(scene.mesh, scene.views, scene.kind, device, seed)
-        if working is None:
-            return _unmoved(came)
     found, poses = _poses(working, given)
+    distortion, common = None, None
+    described = dict[str, Any]()
+    if shared:
+        distortion, described["distortion"] = refine_distortion(working, found)
+        if distortion is not None:
+            scene = replace(scene, views=_straightened(scene.views, distortion))
+            working = working_views(scene.mesh, scene.views, scene.kind, device, seed)
+            if working is None:
+                return _unmoved(came)
+        common, described["device"] = _device(working)
+        if common is not None:
+            common = common.at_scale(*scale)
+            scene = replace(scene, views=tuple(_on_device(view, common) for view in scene.views))
+            described["device"] |= _describe(common, scene.views[0].camera)
+            given = common.offset.to(given) @ given
+            working = working_views(scene.mesh, scene.views, scene.kind, device, seed)
+            if working is None:
+                return _unmoved(came)
+        if distortion is not None or common is not None:
+            found, poses = _poses(working, given)
     gain, offset, exposures = _exposures(working, found)
     moved = motion(found, replace(working, given=given)) * torch.tensor([1.0, 1.0, scale[0]])
     columns = {**poses, "by_depth": by_depth, **exposures, "gain": gain, "offset": offset}
@@ -125,18 +139,19 @@ def refine_cameras(scene: Scene, device: torch.device, seed: int) -> Refinement:
     common_motion = motion(found, replace(working, given=keep_gauge(found, working.given, working.fitted)))
     totals = {key: _plain(columns[key].double().nanmean()) for key in columns if columns[key].ndim == 1}
     totals["common_pixels"] = _plain(common_motion[:, 2].nanmean() * scale[0])
-    described |= {} if common is None else _describe(common, scene.views[0].camera)
-    report = {"device": described, "mean": totals, "frames": frames}
-    shared = (None, None) if common is None else (common.lens.cpu(), common.offset.cpu())
-    return Refinement(found.cpu(), gain.cpu(), offset.cpu(), report, *shared)
+    report = {**described, "mean": totals, "frames": frames}
+    lens, place = (None, None) if common is None else (common.lens.cpu(), common.offset.cpu())
+    return Refinement(found.cpu(), gain.cpu(), offset.cpu(), report, lens, place, distortion)
 
 
 def apply_refinement(scene: Scene, refinement: Refinement) -> Scene:
     """The scene with its training views' cameras moved, their colors corrected, and its vertices moved.
 
-    Held-out views are as they came but for a correction of the device.
+    Held-out views are as they came but for corrections of the lens and the device.
     """
     given, heldout = scene.views, scene.heldout
+    if refinement.distortion is not None:
+        given, heldout = (_straightened(part, refinement.distortion) for part in (given, heldout))
     if refinement.lens is not None and refinement.device_offset is not None:
         common = Device(refinement.lens, refinement.device_offset)
         given, heldout = (tuple(_on_device(view, common) for view in part) for part in (given, heldout))
@@ -158,7 +173,13 @@ def _unmoved(scene: Scene) -> Refinement:
     """Nothing to go by: everything as it came."""
     given = torch.stack([view.camera.world_to_camera for view in scene.views]).double()
     ones = torch.ones((len(given), 3))
-    return Refinement(given, ones, torch.zeros_like(ones), {"device": {"corrected": False}, "mean": {}, "frames": []})
+    uncorrected = {"distortion": {"corrected": False}, "device": {"corrected": False}}
+    return Refinement(given, ones, torch.zeros_like(ones), {**uncorrected, "mean": {}, "frames": []})
+
+
+def _straightened(views: tuple[View, ...], distortion: Tensor) -> tuple[View, ...]:
+    with one_thread_each():
+        return tuple(in_threads(lambda view: straightened(view, distortion), views))
 
 
 def _on_device(view: View, common: Device) -> View:

@@ -20,9 +20,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advtex_engine.core.scene import Mesh, View
-from advtex_engine.refine.check import MARGIN, better, disagreement, improved
+from advtex_engine.refine.check import MARGIN, better, disagreement, improved, rounded
 from advtex_engine.refine.points import Observations
-from advtex_engine.refine.pose import ROBUST_SCALE, local_contrast, sample_points
+from advtex_engine.refine.pose import ROBUST_SCALE, local_contrast, sample_features, sample_points
 from advtex_engine.refine.solve import residuals
 from advtex_engine.refine.working_views import CHECKED_SHARE, CONTRAST_SCALE, WorkingViews, working_views
 from advtex_engine.render.texture import bilinear_footprint
@@ -57,7 +57,7 @@ def warp_views(
     offsets = offsets * good[:, None, None, None] * scale
     moved = _interpolated(offsets, *_footprints(seen.pixel, working.size, offsets.shape[1])).norm(dim=-1)
     moved = torch.where(seen.valid, moved, torch.nan)
-    report |= {"median_pixels": _plain(moved.nanmedian()), "largest_pixels": _plain(moved.nan_to_num().max())}
+    report |= {"median_pixels": rounded(moved.nanmedian()), "largest_pixels": rounded(moved.nan_to_num().max())}
     kept = good.tolist()
     report["unwarped"] = [view.name for view, warped in zip(views, kept, strict=True) if not warped]
     pairs = zip(views, offsets, kept, strict=True)
@@ -96,7 +96,7 @@ def fit_offsets(luminance: Tensor, pixel: Tensor, points: Observations) -> Tenso
         features = local_contrast(luminance, scale)
         for _ in range(steps):
             place = pixel + _interpolated(offsets, nodes, share)
-            value, gradient, inside = _sample(features, place, (width, height))
+            value, gradient, inside = sample_features(features, place, (width, height))
             residual, weight = residuals(value, points.seen & inside, points, ROBUST_SCALE)
             step = solve_offsets(gradient, residual, weight, nodes, share, offsets)
             offsets = offsets + step.clamp(-LARGEST_STEP * scale, LARGEST_STEP * scale)
@@ -173,14 +173,6 @@ def _interpolated(offsets: Tensor, nodes: Tensor, share: Tensor) -> Tensor:
     return (offsets.flatten(1, 2)[view, nodes] * share[..., None]).sum(2)
 
 
-def _sample(features: Tensor, pixel: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Value [V,K] and gradient [V,K,2] of `local_contrast` at pixels [V,K,2], and whether these are inside, [V,K]."""
-    extent = pixel.new_tensor(size)
-    inside = ((pixel > 1) & (pixel < extent - 1)).all(-1)
-    found = F.grid_sample(features, (2 * pixel / extent - 1)[:, :, None], padding_mode="border", align_corners=False)
-    return found[:, 0, :, 0], found[:, 1:, :, 0].mT, inside
-
-
 def _points(working: WorkingViews, seed: int) -> tuple[Observations, Tensor, Tensor]:
     """All points that refinement has, which observations [V,K] are not to be fitted but to be checked, and cells [P].
 
@@ -207,7 +199,7 @@ def _approved(
     """[V] bool, views that the checked points say agree better through their offsets, and the disagreement by then."""
     seen = sample_points(working.features, working.K, working.given, checked, working.size)
     place = seen.pixel + _interpolated(offsets, *_footprints(seen.pixel, working.size, offsets.shape[1]))
-    value, _, inside = _sample(working.features, place, working.size)
+    value, _, inside = sample_features(working.features, place, working.size)
     valid, old = seen.valid & inside, seen.value[..., None]
     good = torch.ones(len(offsets), dtype=torch.bool, device=offsets.device)
     before = disagreement(old, valid, checked, CONTRAST_SCALE)
@@ -221,9 +213,4 @@ def _approved(
         good &= approved
     if not better(old, new, valid, checked, cell, CONTRAST_SCALE):
         good, after = torch.zeros_like(good), before
-    return good, {"residual_before": _plain(before.nanmean()), "residual_after": _plain(after.nanmean())}
-
-
-def _plain(value: Tensor) -> float | None:
-    """Four decimals; None for nan."""
-    return None if bool(value.isnan()) else round(float(value), 4)
+    return good, {"residual_before": rounded(before.nanmean()), "residual_after": rounded(after.nanmean())}

@@ -11,6 +11,7 @@ import cv2
 import discriminator
 import game
 import harness
+import learning
 import losses
 import numpy as np
 import paper
@@ -86,6 +87,42 @@ def test_scans_are_put_together_by_geometric_means() -> None:
     assert "| mean | 0.200 | 0.100 | - | - |" in table
     assert "| l1 |" not in table
     assert harness.geometric_means("method", {"mean": [cell(0.1, 0.01)]}) == ""
+
+
+def test_every_way_to_learn_is_tried(tmp_path: Path) -> None:
+    synthesize(tmp_path / "desk", views=18, width=96, height=64)
+    line = [str(tmp_path / "desk"), "--scan-size", "96x64", "--steps", "10", "--device", "cpu"]
+    for seeds in ("1", "1"):  # the second time nothing is missing
+        learning.main([*line, "--seeds", seeds, "--results", str(tmp_path / "out")])
+    cells = json.loads((tmp_path / "out" / "learning.json").read_text())["cells"]
+    assert [cell["settings"]["option"] for cell in cells] == list(learning.OPTIONS)
+    # Views as small as these are not aligned, and of a view's few pairs each is in the nearest half.
+    assert len({cell["scores"]["margin 1"] for cell in cells}) == len(cells) - 2, "each is an option of its own"
+    page = (tmp_path / "out" / "learning.md").read_text()
+    assert all(f"| {option} |" in page for option in learning.OPTIONS)
+
+
+def test_a_normalized_convolution_has_no_gain_above_one() -> None:
+    network = learning.Spectral(torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        network.convolutions[0].weight *= 50  # type: ignore[operator,union-attr]
+    x = torch.rand(1, 6, 64, 64)
+    for _ in range(30):
+        small, _ = network.examine(x)
+        large, _ = network.examine(x, [10 * p if p.dim() > 1 else p for p in network.parameters()])
+    assert torch.allclose(small, large, rtol=0.02, atol=1e-5)
+
+
+def test_mirrored_examples_keep_the_places_of_their_patches() -> None:
+    network = learning.Augmented(torch.Generator().manual_seed(0))
+    x = torch.zeros(1, 6, 96, 128)
+    x[:, :, 40:48, 16:24] = 1.0
+    torch.manual_seed(0)
+    for _ in range(6):
+        logits, _ = network.examine(x)
+        off = (logits - logits[0, 0, -1, -1]).abs()[0, 0]
+        row, column = divmod(int(off.argmax()), off.shape[1])
+        assert abs(12 + 8 * row - 44) <= 24 and abs(12 + 8 * column - 20) <= 24
 
 
 @pytest.mark.slow

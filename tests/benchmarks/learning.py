@@ -1,0 +1,317 @@
+"""What helps a discriminator to learn: how many patches it tells apart of a texture that stands still.
+
+    python tests/benchmarks/learning.py SCAN … [--scan-size 192x144] [--steps 2000] [--options NAME …] [--seeds 1]
+
+The start of the preset `standard` does not move, so that what is told apart grows or stays: half of the patches by
+guessing, all by one that knows everything. Each option changes one thing of the discriminator, of how it learns, or of
+the examples that it is shown; told apart are the patches since the reading before. With --seeds it begins as often,
+each time from other weights, and the least of the seeds says whether one collapsed.
+
+Writes learning.json (a cell per scan, option and seed) and learning.md below --results; goes on with missing cells when
+started again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import statistics
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from harness import RESULTS, Results, Stopwatch, markdown_table, parsed_size, prepare, started, write_report
+from paper import HOLDOUT, SCAN_FACES
+from torch import Tensor, nn
+
+from advtex_engine.adversarial.discriminator import STRIDES, PatchDiscriminator
+from advtex_engine.adversarial.optimizer import AdversarialOptimizer, Losses
+from advtex_engine.core.config import TextureConfig, resolve_preset
+from advtex_engine.methods import MethodInput
+from advtex_engine.methods.adversarial import pairs_of
+from advtex_engine.runtime.devices import choose_device
+
+SHARES = (0.1, 0.25, 0.5, 1.0)
+"""Of the steps, at which is read out."""
+SLOPE = 0.2
+PENALTY = 10.0
+"""Of R1 (Mescheder et al. 2018), gamma."""
+CROPS = 4
+
+
+class He(PatchDiscriminator):
+    """Begins with the variance that keeps responses as large from layer to layer (He et al. 2015)."""
+
+    def __init__(self, generator: torch.Generator) -> None:
+        super().__init__(generator)
+        for layer in self.convolutions:
+            assert isinstance(layer, nn.Conv2d)
+            nn.init.kaiming_normal_(layer.weight, SLOPE, generator=generator)
+
+
+class LargeResidual(PatchDiscriminator):
+    """The residual has a tenth of the condition's standard deviation: ten times of it have the same."""
+
+    def examine(self, x: Tensor, parameters: Sequence[Tensor] | None = None) -> tuple[Tensor, list[Tensor]]:
+        return super().examine(torch.cat((x[:, :3], 10 * x[:, 3:]), 1), parameters)
+
+
+class Both(LargeResidual, He):
+    """He's start, and a large residual."""
+
+
+class Spectral(Both):
+    """Each convolution divided by its largest singular value (Miyato et al. 2018), one step of power iteration each."""
+
+    def __init__(self, generator: torch.Generator) -> None:
+        super().__init__(generator)
+        sizes = [layer.weight.shape[0] for layer in self.convolutions]  # type: ignore[union-attr,index]
+        self.directions = [F.normalize(torch.randn(int(size), generator=generator), dim=0) for size in sizes]
+
+    def examine(self, x: Tensor, parameters: Sequence[Tensor] | None = None) -> tuple[Tensor, list[Tensor]]:
+        given = list(self.parameters() if parameters is None else parameters)
+        for index in range(len(self.directions)):
+            with torch.no_grad():
+                matrix = given[2 * index].detach().float().flatten(1)
+                other = F.normalize(matrix.T @ self.directions[index].to(matrix), dim=0)
+                self.directions[index] = F.normalize(matrix @ other, dim=0)
+                largest = self.directions[index] @ matrix @ other
+            given[2 * index] = given[2 * index] / largest.to(given[2 * index].dtype)
+        return super().examine(x, given)
+
+
+class Instance(Both):
+    """Instance normalization (Ulyanov et al. 2016) of the three inner layers."""
+
+    def examine(self, x: Tensor, parameters: Sequence[Tensor] | None = None) -> tuple[Tensor, list[Tensor]]:
+        given = list(self.parameters() if parameters is None else parameters)
+        x = torch.cat((x[:, :3], 10 * x[:, 3:6]), 1).to(given[0].dtype)
+        features = list[Tensor]()
+        for index, stride in enumerate(STRIDES):
+            x = F.conv2d(x, given[2 * index], given[2 * index + 1], stride, padding=1)
+            if index < len(STRIDES) - 1:
+                x = F.leaky_relu(F.instance_norm(x) if index else x, SLOPE)
+                features.append(x)
+        return x, features
+
+
+class TwoScales(Both):
+    """The mean of two, one of which sees the images at half their size (Wang et al. 2018)."""
+
+    def __init__(self, generator: torch.Generator) -> None:
+        super().__init__(generator)
+        self.smaller = Both(generator)
+
+    def examine(self, x: Tensor, parameters: Sequence[Tensor] | None = None) -> tuple[Tensor, list[Tensor]]:
+        given = list(self.parameters() if parameters is None else parameters)
+        count = len(given) // 2
+        logits, features = super().examine(x, given[:count])
+        coarse, _ = self.smaller.examine(F.avg_pool2d(x, 2), given[count:])
+        return (logits + F.interpolate(coarse, logits.shape[-2:], mode="bilinear")) / 2, features
+
+
+class Augmented(Both):
+    """Examples mirrored and with their channels in another order, by chance; patches stay where they are."""
+
+    def examine(self, x: Tensor, parameters: Sequence[Tensor] | None = None) -> tuple[Tensor, list[Tensor]]:
+        flipped = [side for side in (2, 3) if torch.rand(()) < 0.5]
+        order = torch.randperm(3)
+        logits, features = super().examine(x[:, torch.cat((order, 3 + order))].flip(flipped), parameters)
+        return logits.flip(flipped), features
+
+
+class Watched(Both):
+    """Keeps the last example, which is the real one, and its logits."""
+
+    def examine(self, x: Tensor, parameters: Sequence[Tensor] | None = None) -> tuple[Tensor, list[Tensor]]:
+        x = x if x.requires_grad else x.detach().requires_grad_()
+        logits, features = super().examine(x, parameters)
+        self.last = (x, logits)
+        return logits, features
+
+
+class Penalized(AdversarialOptimizer):
+    """R1: the discriminator's slope at real examples costs."""
+
+    def _discriminator_gradients(self, losses: Losses) -> tuple[Tensor, ...]:
+        assert isinstance(self.discriminator, Watched)
+        real, logits = self.discriminator.last
+        (slope,) = torch.autograd.grad(logits.sum(), [real], create_graph=True)
+        penalty = PENALTY / 2 * slope.float().square().sum() / logits.numel()
+        penalized = dataclasses.replace(losses, discriminator=losses.discriminator + penalty)
+        return super()._discriminator_gradients(penalized)
+
+
+class SeveralCrops(AdversarialOptimizer):
+    """The mean gradient of CROPS crops a step."""
+
+    def _discriminator_gradients(self, losses: Losses) -> tuple[Tensor, ...]:
+        total = super()._discriminator_gradients(losses)
+        for _ in range(CROPS - 1):
+            torch._foreach_add_(total, super()._discriminator_gradients(self.play(self.draw())))
+        torch._foreach_div_(total, CROPS)
+        return total
+
+
+@dataclasses.dataclass(frozen=True)
+class Option:
+    """A discriminator, how it learns, and what differs from the preset."""
+
+    discriminator: type[PatchDiscriminator] = Both
+    optimizer: type[AdversarialOptimizer] = AdversarialOptimizer
+    preset: dict[str, Any] = dataclasses.field(default_factory=lambda: {"lr_discriminator": 2e-4})
+
+
+SLOW = {"lr_discriminator": 2e-4}
+OPTIONS = {
+    "as in `standard`": Option(PatchDiscriminator, preset={}),
+    "a quarter of its rate": Option(PatchDiscriminator),
+    "He": Option(He),
+    "ten times the residual": Option(LargeResidual),
+    "both": Option(),
+    "both, at `standard`'s rate": Option(preset={}),
+    "both, half the rate": Option(preset={"lr_discriminator": 1e-4}),
+    "both, spectral normalization": Option(Spectral),
+    "both, instance normalization": Option(Instance),
+    "both, two scales": Option(TwoScales),
+    "both, augmented": Option(Augmented),
+    "both, R1": Option(Watched, Penalized),
+    "both, four crops a step": Option(optimizer=SeveralCrops),
+    "both, examples not aligned": Option(preset={**SLOW, "alignment": False}),
+    "both, examples as photographed": Option(preset={**SLOW, "toned": False}),
+    "both, the nearest half of the pairs": Option(preset={**SLOW, "nearest_share": 0.5}),
+    "both, the source itself, displaced": Option(preset={**SLOW, "auxiliary": False, "perturbation": 1 / 320}),
+}
+
+
+def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scans", nargs="+", type=Path, help="folders or zip files")
+    parser.add_argument("--scan-size", default="192x144", help="WIDTHxHEIGHT of the views")
+    parser.add_argument("--steps", type=int, default=2_000)
+    parser.add_argument("--options", nargs="+", default=list(OPTIONS), choices=OPTIONS, metavar="NAME")
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--results", type=Path, default=RESULTS / "learning", help="folder of the results")
+    parsed: argparse.Namespace = parser.parse_args(line)
+    return parsed
+
+
+def settings_of(arguments: argparse.Namespace, scan: Path, option: str, seed: int) -> dict[str, Any]:
+    """What a cell is found by."""
+    return {
+        "scan": scan.stem,
+        "size": arguments.scan_size,
+        "steps": arguments.steps,
+        "option": option,
+        "seed": seed,
+    }
+
+
+def learn(given: MethodInput, option: Option, steps: int, seed: int) -> dict[str, float]:
+    """Shares told apart, and margins, before each of SHARES of the steps."""
+    torch.manual_seed(seed)
+    maps, start = given.maps[1], given.start
+    assert start is not None
+    optimizer = option.optimizer(
+        maps,
+        pairs_of(given, maps),
+        start[maps.slot_map >= 0],
+        given.preset,
+        kind=given.scene.kind,
+        steps=steps,
+        generator=torch.Generator(maps.device).manual_seed(seed),
+        discriminator=option.discriminator(torch.Generator().manual_seed(seed)).to(maps.device),
+    )
+    found = dict[str, float]()
+    for share in SHARES:
+        while optimizer.index < round(share * steps):
+            optimizer.step()
+        read = optimizer.drain_losses()
+        found |= {f"{name} {share:g}": read[name] for name in ("accuracy", "margin")}
+    return found
+
+
+def fill(arguments: argparse.Namespace, results: Results) -> None:
+    """Runs every cell that is not in the results yet."""
+    device = choose_device(arguments.device)
+    for scan in arguments.scans:
+        missing = [
+            (option, seed)
+            for option in arguments.options
+            for seed in range(arguments.seeds)
+            if results.find(settings_of(arguments, scan, option, seed)) is None
+        ]
+        if not missing:
+            continue
+        config = TextureConfig(
+            preset="standard",
+            size=parsed_size(arguments.scan_size),
+            holdout=HOLDOUT,
+            face_budget=SCAN_FACES,
+            device=arguments.device,
+        )
+        with tempfile.TemporaryDirectory(prefix="advtex-learning-") as folder:
+            prepared = prepare(scan, config, Path(folder), device)
+        preset = dataclasses.replace(
+            resolve_preset(config, device.type), pretraining=arguments.steps, feature_weight=0.0, gabor_weight=0.0
+        )
+        starts = dict[bool, MethodInput]()
+        for name, seed in missing:
+            option = OPTIONS[name]
+            changed = dataclasses.replace(preset, **option.preset)
+            if changed.toned not in starts:
+                starts[changed.toned] = started(dataclasses.replace(prepared, preset=changed))
+            watch = Stopwatch()
+            given = dataclasses.replace(starts[changed.toned], preset=changed)
+            scores = learn(given, option, arguments.steps, seed)
+            results.add(settings_of(arguments, scan, name, seed), scores, watch.seconds)
+
+
+def report(arguments: argparse.Namespace, results: Results) -> None:
+    """learning.md: a line per option; per scan its mean share at the end, and over all scans and seeds the least."""
+    lines, found = list[list[Any]](), list[dict[str, Any]]()
+    for name in OPTIONS:
+        of_scans = [
+            [
+                cell
+                for seed in range(arguments.seeds)
+                if (cell := results.find(settings_of(arguments, scan, name, seed)))
+            ]
+            for scan in arguments.scans
+        ]
+        every = [cell for cells in of_scans for cell in cells]
+        if not every:
+            continue
+        found += every
+        means = [_mean(cells, SHARES[-1]) for cells in of_scans]
+        early = [statistics.mean(cell["scores"][f"accuracy {share:g}"] for cell in every) for share in SHARES[:-1]]
+        least = min(cell["scores"][f"accuracy {SHARES[-1]:g}"] for cell in every)
+        lines.append(
+            [name, *means, *early, least, 1000 * statistics.mean(c["seconds"] for c in every) / arguments.steps]
+        )
+    head = ["option", *(scan.stem for scan in arguments.scans)]
+    head += [f"all, until step {round(share * arguments.steps)}" for share in SHARES[:-1]] + ["least", "ms a step"]
+    body = (
+        f"\nShare of patches told apart, {arguments.scan_size}, {arguments.steps} steps, {arguments.seeds} seeds; in"
+        f" the second half of the steps, but for the columns that say otherwise.\n\n{markdown_table(head, lines)}"
+    )
+    write_report(arguments.results / "learning.md", "What helps a discriminator to learn", found, body)
+
+
+def _mean(cells: Sequence[dict[str, Any]], share: float) -> float | None:
+    return statistics.mean(cell["scores"][f"accuracy {share:g}"] for cell in cells) if cells else None
+
+
+def main(line: list[str] | None = None) -> None:
+    arguments = arguments_of(line)
+    results = Results(arguments.results / "learning.json")
+    fill(arguments, results)
+    report(arguments, results)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,11 +1,13 @@
 """What helps a discriminator to learn: how many patches it tells apart of a texture that stands still.
 
     python tests/benchmarks/learning.py SCAN … [--scan-size 192x144] [--steps 2000] [--options NAME …] [--seeds 1]
+        [--elsewhere]
 
 The start of the preset `standard` does not move, so that what is told apart grows or stays: half of the patches by
 guessing, all by one that knows everything. Each option changes one thing of the discriminator, of how it learns, or of
 the examples that it is shown; told apart are the patches since the reading before. With --seeds it begins as often,
-each time from other weights, and the least of the seeds says whether one collapsed.
+each time from other weights, and the least of the seeds says whether one collapsed. With --elsewhere it learns for
+--steps on every other scan, by turns, and is then asked about a scan that it has never seen, and learns nothing there.
 
 Writes learning.json (a cell per scan, option and seed) and learning.md below --results; goes on with missing cells when
 started again.
@@ -28,6 +30,7 @@ from paper import HOLDOUT, SCAN_FACES
 from torch import Tensor, nn
 
 from advtex_engine.adversarial.discriminator import STRIDES, PatchDiscriminator
+from advtex_engine.adversarial.game import knowledge
 from advtex_engine.adversarial.optimizer import AdversarialOptimizer, Losses
 from advtex_engine.core.config import TextureConfig, resolve_preset
 from advtex_engine.methods import MethodInput
@@ -40,6 +43,8 @@ SLOPE = 0.2
 PENALTY = 10.0
 """Of R1 (Mescheder et al. 2018), gamma."""
 CROPS = 4
+DRAWS = 200
+"""Pairs of a scan that nothing is learned of."""
 
 
 class He(PatchDiscriminator):
@@ -194,29 +199,25 @@ def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--steps", type=int, default=2_000)
     parser.add_argument("--options", nargs="+", default=list(OPTIONS), choices=OPTIONS, metavar="NAME")
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--elsewhere", action="store_true", help="what is learned on all scans but one, of that one")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--results", type=Path, default=RESULTS / "learning", help="folder of the results")
     parsed: argparse.Namespace = parser.parse_args(line)
     return parsed
 
 
-def settings_of(arguments: argparse.Namespace, scan: Path, option: str, seed: int) -> dict[str, Any]:
+def settings_of(arguments: argparse.Namespace, scan: Path, option: str, seed: int, elsewhere: bool) -> dict[str, Any]:
     """What a cell is found by."""
-    return {
-        "scan": scan.stem,
-        "size": arguments.scan_size,
-        "steps": arguments.steps,
-        "option": option,
-        "seed": seed,
-    }
+    others = sorted(other.stem for other in arguments.scans if other != scan) if elsewhere else []
+    shared = {"size": arguments.scan_size, "steps": arguments.steps, "option": option, "seed": seed}
+    return {"scan": scan.stem, **shared, "learned_on": " ".join(others) or scan.stem}
 
 
-def learn(given: MethodInput, option: Option, steps: int, seed: int) -> dict[str, float]:
-    """Shares told apart, and margins, before each of SHARES of the steps."""
-    torch.manual_seed(seed)
+def optimizer_of(given: MethodInput, option: Option, steps: int, seed: int) -> AdversarialOptimizer:
+    """At the given start, which does not move for as long as the preset's pretraining lasts."""
     maps, start = given.maps[1], given.start
     assert start is not None
-    optimizer = option.optimizer(
+    return option.optimizer(
         maps,
         pairs_of(given, maps),
         start[maps.slot_map >= 0],
@@ -226,6 +227,12 @@ def learn(given: MethodInput, option: Option, steps: int, seed: int) -> dict[str
         generator=torch.Generator(maps.device).manual_seed(seed),
         discriminator=option.discriminator(torch.Generator().manual_seed(seed)).to(maps.device),
     )
+
+
+def learn(given: MethodInput, option: Option, steps: int, seed: int) -> dict[str, float]:
+    """Shares told apart, and margins, before each of SHARES of the steps."""
+    torch.manual_seed(seed)
+    optimizer = optimizer_of(given, option, steps, seed)
     found = dict[str, float]()
     for share in SHARES:
         while optimizer.index < round(share * steps):
@@ -235,71 +242,110 @@ def learn(given: MethodInput, option: Option, steps: int, seed: int) -> dict[str
     return found
 
 
+def learn_elsewhere(
+    unseen: MethodInput, others: Sequence[MethodInput], option: Option, steps: int, seed: int
+) -> dict[str, float]:
+    """What is told apart of a scan after so many steps on each of the others, by turns; nothing is learned of it."""
+    torch.manual_seed(seed)
+    last, *players = (optimizer_of(given, option, steps, seed) for given in (unseen, *others))
+    first = players[0]
+    for parameter, gradient in zip(first.parameters, first._gradients, strict=True):
+        parameter.grad = gradient
+    for player in players:  # one discriminator, one state of its Adam
+        player.discriminator, player.parameters = first.discriminator, first.parameters
+        player._gradients, player.adam_discriminator = first._gradients, first.adam_discriminator
+        player.bfloat16 = player.bfloat16
+    for _ in range(steps):
+        for player in players:
+            player.step()
+    last.discriminator, last.parameters = first.discriminator, first.parameters
+    last.bfloat16 = last.bfloat16
+    last.schedule.read()
+    told = torch.stack([last.play(last.draw()).told for _ in range(DRAWS)]).sum(0)
+    read = knowledge(told.tolist())
+    return {f"{name} {SHARES[-1]:g}": read[name] for name in ("accuracy", "margin")}
+
+
 def fill(arguments: argparse.Namespace, results: Results) -> None:
     """Runs every cell that is not in the results yet."""
     device = choose_device(arguments.device)
+    cells = [(option, seed) for option in arguments.options for seed in range(arguments.seeds)]
+
+    def lacks(scan: Path, option: str, seed: int) -> bool:
+        return results.find(settings_of(arguments, scan, option, seed, arguments.elsewhere)) is None
+
+    config = TextureConfig(
+        preset="standard",
+        size=parsed_size(arguments.scan_size),
+        holdout=HOLDOUT,
+        face_budget=SCAN_FACES,
+        device=arguments.device,
+    )
+    preset = dataclasses.replace(
+        resolve_preset(config, device.type), pretraining=arguments.steps, feature_weight=0.0, gabor_weight=0.0
+    )
+    starts = dict[tuple[Path, bool], MethodInput]()
+
+    def given(scan: Path, option: Option) -> MethodInput:
+        changed = dataclasses.replace(preset, **option.preset)
+        key = (scan, changed.toned)
+        if key not in starts:
+            with tempfile.TemporaryDirectory(prefix="advtex-learning-") as folder:
+                prepared = prepare(scan, config, Path(folder), device)
+            starts[key] = started(dataclasses.replace(prepared, preset=changed))
+        return dataclasses.replace(starts[key], preset=changed)
+
     for scan in arguments.scans:
-        missing = [
-            (option, seed)
-            for option in arguments.options
-            for seed in range(arguments.seeds)
-            if results.find(settings_of(arguments, scan, option, seed)) is None
-        ]
-        if not missing:
-            continue
-        config = TextureConfig(
-            preset="standard",
-            size=parsed_size(arguments.scan_size),
-            holdout=HOLDOUT,
-            face_budget=SCAN_FACES,
-            device=arguments.device,
-        )
-        with tempfile.TemporaryDirectory(prefix="advtex-learning-") as folder:
-            prepared = prepare(scan, config, Path(folder), device)
-        preset = dataclasses.replace(
-            resolve_preset(config, device.type), pretraining=arguments.steps, feature_weight=0.0, gabor_weight=0.0
-        )
-        starts = dict[bool, MethodInput]()
-        for name, seed in missing:
+        for name, seed in cells:
+            if not lacks(scan, name, seed):
+                continue
             option = OPTIONS[name]
-            changed = dataclasses.replace(preset, **option.preset)
-            if changed.toned not in starts:
-                starts[changed.toned] = started(dataclasses.replace(prepared, preset=changed))
+            this = given(scan, option)
+            others = [given(other, option) for other in arguments.scans if other != scan and arguments.elsewhere]
             watch = Stopwatch()
-            given = dataclasses.replace(starts[changed.toned], preset=changed)
-            scores = learn(given, option, arguments.steps, seed)
-            results.add(settings_of(arguments, scan, name, seed), scores, watch.seconds)
+            if arguments.elsewhere:
+                scores = learn_elsewhere(this, others, option, arguments.steps, seed)
+            else:
+                scores = learn(this, option, arguments.steps, seed)
+            results.add(settings_of(arguments, scan, name, seed, arguments.elsewhere), scores, watch.seconds)
+        if not arguments.elsewhere:
+            starts.clear()
 
 
 def report(arguments: argparse.Namespace, results: Results) -> None:
     """learning.md: a line per option; per scan its mean share at the end, and over all scans and seeds the least."""
-    lines, found = list[list[Any]](), list[dict[str, Any]]()
-    for name in OPTIONS:
-        of_scans = [
-            [
-                cell
-                for seed in range(arguments.seeds)
-                if (cell := results.find(settings_of(arguments, scan, name, seed)))
-            ]
-            for scan in arguments.scans
-        ]
-        every = [cell for cells in of_scans for cell in cells]
-        if not every:
-            continue
-        found += every
-        means = [_mean(cells, SHARES[-1]) for cells in of_scans]
-        early = [statistics.mean(cell["scores"][f"accuracy {share:g}"] for cell in every) for share in SHARES[:-1]]
-        least = min(cell["scores"][f"accuracy {SHARES[-1]:g}"] for cell in every)
-        lines.append(
-            [name, *means, *early, least, 1000 * statistics.mean(c["seconds"] for c in every) / arguments.steps]
-        )
-    head = ["option", *(scan.stem for scan in arguments.scans)]
-    head += [f"all, until step {round(share * arguments.steps)}" for share in SHARES[:-1]] + ["least", "ms a step"]
-    body = (
-        f"\nShare of patches told apart, {arguments.scan_size}, {arguments.steps} steps, {arguments.seeds} seeds; in"
-        f" the second half of the steps, but for the columns that say otherwise.\n\n{markdown_table(head, lines)}"
+    body, found = "", list[dict[str, Any]]()
+    for elsewhere, title in ((False, "Learned on the scan"), (True, "Learned on all other scans")):
+        lines = list[list[Any]]()
+        for name in OPTIONS:
+            of_scans = [_cells(arguments, results, scan, name, elsewhere) for scan in arguments.scans]
+            if every := [cell for cells in of_scans for cell in cells]:
+                found += every
+                means = [_mean(cells, SHARES[-1]) for cells in of_scans]
+                early = [] if elsewhere else [_mean(every, share) for share in SHARES[:-1]]
+                least = min(cell["scores"][f"accuracy {SHARES[-1]:g}"] for cell in every)
+                lines.append([name, *means, *early, least, len(every)])
+        if lines:
+            head = ["option", *(scan.stem for scan in arguments.scans)]
+            if not elsewhere:
+                head += [f"all, until step {round(share * arguments.steps)}" for share in SHARES[:-1]]
+            body += f"\n## {title}\n\n{markdown_table([*head, 'least', 'runs'], lines)}"
+    told = (
+        f"\nShare of patches told apart, {arguments.scan_size}, {arguments.steps} steps; in the second half of them,"
+        " but for the columns that say otherwise, and for scans that nothing is learned of.\n"
     )
-    write_report(arguments.results / "learning.md", "What helps a discriminator to learn", found, body)
+    write_report(arguments.results / "learning.md", "What helps a discriminator to learn", found, told + body)
+
+
+def _cells(
+    arguments: argparse.Namespace, results: Results, scan: Path, option: str, elsewhere: bool
+) -> list[dict[str, Any]]:
+    """Those of all seeds that were run."""
+    rows = [result["settings"]["seed"] for result in results.cells]
+    found = (
+        results.find(settings_of(arguments, scan, option, seed, elsewhere)) for seed in range(max(rows, default=0) + 1)
+    )
+    return [cell for cell in found if cell is not None]
 
 
 def _mean(cells: Sequence[dict[str, Any]], share: float) -> float | None:

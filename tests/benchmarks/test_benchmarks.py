@@ -102,6 +102,18 @@ def test_every_way_to_learn_is_tried(tmp_path: Path) -> None:
     assert all(f"| {option} |" in page for option in learning.OPTIONS)
 
 
+def test_what_is_learned_elsewhere_is_asked_of_a_scan_that_was_not_seen(tmp_path: Path) -> None:
+    scans = [tmp_path / name for name in ("desk", "shelf", "room")]
+    for seed, scan in enumerate(scans):
+        synthesize(scan, views=18, width=96, height=64, seed=seed)
+    line = [*map(str, scans), "--scan-size", "96x64", "--steps", "3", "--device", "cpu", "--options", "both"]
+    learning.main([*line, "--elsewhere", "--results", str(tmp_path / "out")])
+    cells = json.loads((tmp_path / "out" / "learning.json").read_text())["cells"]
+    assert [cell["settings"]["learned_on"] for cell in cells] == ["room shelf", "desk room", "desk shelf"]
+    assert all(0.3 < cell["scores"]["accuracy 1"] < 0.7 for cell in cells)
+    assert "## Learned on all other scans" in (tmp_path / "out" / "learning.md").read_text()
+
+
 def test_a_normalized_convolution_has_no_gain_above_one() -> None:
     network = learning.Spectral(torch.Generator().manual_seed(0))
     with torch.no_grad():

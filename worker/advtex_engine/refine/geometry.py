@@ -128,7 +128,7 @@ class _Surface:
         cameras, depths = self._cameras, self._depths
         if mesh is not self.mesh:
             _, depths = surface_depths(mesh, self._scene.views, self._size, self._scene.kind)
-        detail = self._features[:, 1:].norm(dim=1)
+        detail = torch.hypot(*self._features[:, 1:].unbind(1))
         surface = draw_candidates(mesh, cameras, depths, detail, self._generator)
         if len(surface.position) < MIN_POINTS:
             return None

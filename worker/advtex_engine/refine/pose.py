@@ -16,6 +16,7 @@ from torch import Tensor
 
 from advtex_engine.refine.points import Observations
 from advtex_engine.refine.solve import Anchor, residuals, solve_views
+from advtex_engine.render.filtering import separable
 
 LEVELS = ((8, 6), (4, 6), (2, 5), (1, 4))  # shrink factor of the image, Gauss-Newton steps
 CONTRAST_RADIUS = 4  # pixels of the level around which local mean and contrast are taken
@@ -63,8 +64,7 @@ def _blurred(image: Tensor, radius: int) -> Tensor:
     offset = torch.arange(-radius, radius + 1, device=image.device, dtype=image.dtype)
     kernel = torch.exp(-2 * (offset / radius).square())
     kernel = kernel / kernel.sum()
-    padded = F.pad(image, (radius,) * 4, mode="replicate")
-    return F.conv2d(F.conv2d(padded, kernel.view(1, 1, 1, -1)), kernel.view(1, 1, -1, 1))
+    return separable(image[:, 0], kernel, border="replicate")[:, None]
 
 
 def sample_points(

@@ -10,6 +10,7 @@ is a mean) couples the views instead, and conjugate gradients solve that without
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -22,10 +23,13 @@ ROBUST_ROUNDS = 3
 
 def weighted_mean(value: Tensor, weight: Tensor, points: Observations) -> tuple[Tensor, Tensor]:
     """Mean of value [V,K] over the views of each point, [P], and the sum of weights [P]."""
-    count = len(points.position)
-    total = value.new_zeros(count).index_add_(0, points.point.flatten(), (value * weight).flatten())
-    weights = value.new_zeros(count).index_add_(0, points.point.flatten(), weight.flatten())
-    return total / weights.clamp(min=1e-6), weights
+    weights = _sums(weight, points)
+    return _sums(value * weight, points) / weights.clamp(min=1e-6), weights
+
+
+def _sums(value: Tensor, points: Observations) -> Tensor:
+    """[P]: of value [V,K] over the views of each point."""
+    return value.new_zeros(len(points.position)).index_add_(0, points.point.flatten(), value.flatten())
 
 
 def residuals(value: Tensor, valid: Tensor, points: Observations, scale: float) -> tuple[Tensor, Tensor]:
@@ -54,15 +58,18 @@ class Anchor:
         """The term's matrix times x [V,Q]."""
         out = torch.zeros_like(x)
         for component in self.jacobian:
-            mean, _ = weighted_mean((x[:, None] @ component)[:, 0], self.weight, self.points)
+            mean = _sums((x[:, None] @ component)[:, 0] * self.weight, self.points) / self._weights
             out += (component @ (self.weight * mean[self.points.point])[..., None])[..., 0]
         return out
 
     def blocks(self) -> Tensor:
         """The term's matrix within each view, [V,Q,Q]."""
-        _, total = weighted_mean(self.weight, self.weight, self.points)
-        share = self.weight.square() / total.clamp(min=1e-6)[self.points.point]
+        share = self.weight.square() / self._weights[self.points.point]
         return torch.stack([(component * share[:, None]) @ component.mT for component in self.jacobian]).sum(0)
+
+    @cached_property
+    def _weights(self) -> Tensor:
+        return _sums(self.weight, self.points).clamp(min=1e-6)
 
 
 def solve_views(
@@ -84,9 +91,11 @@ def solve_views(
         blocks += anchor.blocks()
     factor = torch.linalg.cholesky(blocks.double())
 
+    weights = _sums(weight, points).clamp(min=1e-6)
+
     def product(x: Tensor) -> Tensor:
         moved = (x[:, None] @ jacobian)[:, 0]
-        mean, _ = weighted_mean(moved, weight, points)
+        mean = _sums(moved * weight, points) / weights
         out = (weighted @ (moved - mean[points.point])[..., None])[..., 0] + prior * x
         return out if anchor is None else out + anchor.product(x)
 

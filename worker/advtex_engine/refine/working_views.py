@@ -70,7 +70,7 @@ def working_views(
     features = local_contrast(luminance(color), 1)
     cameras, depths = surface_depths(mesh, views, size, kind)
     K, given = stack_cameras(cameras, device)
-    candidates = draw_candidates(mesh, cameras, depths, features[:, 1:].norm(dim=1), generator)
+    candidates = draw_candidates(mesh, cameras, depths, torch.hypot(*features[:, 1:].unbind(1)), generator)
     if len(candidates.position) < MIN_CANDIDATES:
         return None
     order = order_of_preference(candidates, generator)

@@ -1,4 +1,4 @@
-"""Low-passes of images: every channel by itself, borders mirrored."""
+"""Low-passes of images: every channel by itself."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from torch import Tensor
 
 
 def blurred(planes: Tensor, sigma: float) -> Tensor:
-    """Planes [N,H,W] under a Gaussian of standard deviation `sigma` in pixels; H, W above 4 sigma."""
+    """Planes [N,H,W] under a Gaussian of standard deviation `sigma` in pixels, borders mirrored; H, W above 4 sigma."""
     radius = math.ceil(4 * sigma)
     offset = torch.arange(-radius, radius + 1, dtype=torch.float32, device=planes.device)
     kernel = torch.exp(-offset.square() / (2 * sigma**2))
     return separable(planes, kernel / kernel.sum())
 
 
-def separable(planes: Tensor, kernel: Tensor) -> Tensor:
-    """Planes [N,H,W] under the same kernel [2R+1] across and down."""
+def separable(planes: Tensor, kernel: Tensor, border: str = "reflect") -> Tensor:
+    """Planes [N,H,W] under the same kernel [2R+1] across and down. border: a mode of `F.pad`."""
     radius, count = len(kernel) // 2, len(planes)
-    padded = F.pad(planes, (radius,) * 4, mode="reflect")[None]
-    # Planes as channels of one image: as images of one channel they take a CPU five times as long.
+    padded = F.pad(planes[None], (radius,) * 4, mode=border)
+    # Planes as channels of one image: as images of one channel they take a CPU five to eleven times as long.
     rows = F.conv2d(padded, kernel.expand(count, 1, 1, -1), groups=count)
     return F.conv2d(rows, kernel[:, None].expand(count, 1, -1, 1), groups=count)[0]

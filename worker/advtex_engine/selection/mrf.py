@@ -21,6 +21,7 @@ MAX_COLOR_COST = 3.0
 MESSAGE_ROUNDS = 30
 DAMPING = 0.25
 DESCENT_ROUNDS = 200
+BLOCK = 1 << 16  # edges whose seams are compared at once: bounds the memory
 
 
 @dataclass(frozen=True)
@@ -50,12 +51,21 @@ def edge_ends(t_pos_idx: Tensor, adjacency: Adjacency, number: int) -> Tensor:
 
 
 def seam_costs(t_pos_idx: Tensor, candidates: Candidates, adjacency: Adjacency) -> Tensor:
-    """[E,K,K] cost of showing candidate a of the first and candidate b of the second face beside each other."""
-    first, second = (_along_edge(t_pos_idx, candidates, adjacency, number) for number in (0, 1))
-    difference = torch.cdist(first, second, p=1) / first.shape[2]
-    views = [candidates.view[adjacency.face[:, number]] for number in (0, 1)]
-    cost = SEAM_COST * (1 + (difference / COLOR_COST).clamp(max=MAX_COLOR_COST))
-    return torch.where(views[0][:, :, None] == views[1][:, None, :], 0.0, cost)
+    """[E,K,K] cost of showing candidate a of the first and candidate b of the second face beside each other.
+
+    In memory the edges of each pair of candidates lie side by side, as `solve` reads them.
+    """
+    count, kept = len(adjacency.face), candidates.view.shape[1]
+    costs = torch.empty((kept, kept, count), device=t_pos_idx.device).permute(2, 0, 1)
+    blocks = (torch.split(part, BLOCK) for part in (adjacency.face, adjacency.side, costs))
+    for face, side, cost in zip(*blocks, strict=True):
+        block = Adjacency(face, side)
+        first, second = (_along_edge(t_pos_idx, candidates, block, number) for number in (0, 1))
+        difference = torch.cdist(first, second, p=1) / first.shape[2]
+        one, other = candidates.view[face].unbind(1)
+        cost.copy_(SEAM_COST * (1 + (difference / COLOR_COST).clamp(max=MAX_COLOR_COST)))
+        cost.masked_fill_(one[:, :, None] == other[:, None, :], 0.0)
+    return costs
 
 
 def _along_edge(t_pos_idx: Tensor, candidates: Candidates, adjacency: Adjacency, number: int) -> Tensor:
@@ -82,17 +92,29 @@ def solve(unary: Tensor, pairs: Tensor, pairwise: Tensor) -> Tensor:
         return alone
     node, other = torch.cat((pairs[:, 0], pairs[:, 1])), torch.cat((pairs[:, 1], pairs[:, 0]))
     message = unary.new_zeros((len(node), unary.shape[1]))  # the e-th goes from node to other
+    forth = pairwise.permute(1, 2, 0).contiguous()
+    back = forth.transpose(0, 1)
     reverse = torch.arange(len(node), device=node.device).roll(len(pairs))
     for number in range(MESSAGE_ROUNDS):
         belief = unary.index_add(0, other, message)
         sent = belief[node] - message[reverse]
-        new = torch.cat(
-            ((sent[: len(pairs), :, None] + pairwise).amin(1), (sent[len(pairs) :, None, :] + pairwise).amin(2))
-        )
+        new = torch.cat((_cheapest(sent[: len(pairs)], forth), _cheapest(sent[len(pairs) :], back)))
         new -= new.amin(1, keepdim=True)
         message = new if number == 0 else DAMPING * message + (1 - DAMPING) * new
     agreed = descend(unary.index_add(0, other, message).argmin(1), unary, pairs, pairwise)
     return min(agreed, alone, key=lambda choice: float(energy(choice, unary, pairs, pairwise)))
+
+
+def _cheapest(sent: Tensor, costs: Tensor) -> Tensor:
+    """[E,K]: of each label of an edge's other node the least sum of what is sent [E,K] and of the seam [K,K,E].
+
+    All sums at once would be as much memory as the costs, and five times slower on a CPU.
+    """
+    rows = sent.T.contiguous()
+    least = rows[0] + costs[0]
+    for row, cost in zip(rows[1:], costs[1:], strict=True):
+        torch.minimum(least, row + cost, out=least)
+    return least.T
 
 
 def descend(choice: Tensor, unary: Tensor, pairs: Tensor, pairwise: Tensor) -> Tensor:

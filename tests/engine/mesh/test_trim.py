@@ -77,6 +77,16 @@ def test_small_pieces_of_few_faces_or_far_away_are_dropped_and_counted() -> None
     assert torch.equal(mesh.t_pos_idx, expected.t_pos_idx)
 
 
+def test_a_long_thing_of_few_faces_stays_where_something_is_near() -> None:
+    """The rails of a chair in a room of large faces: 44 faces of 13 cm² each."""
+    floor = of_trimesh(trimesh.creation.box((8.0, 8.0, 0.1)))
+    rail = of_trimesh(trimesh.creation.box((0.36, 0.02, 0.06)))
+    for height, kept in ((0.1, True), (FLOATER_DISTANCE + 0.1, False)):
+        lifted = Mesh(rail.v_pos + torch.tensor([0.0, 0.0, height]), rail.t_pos_idx)
+        mesh, dropped = drop_floaters(joined(floor, lifted))
+        assert (len(mesh.t_pos_idx), dropped) == ((24, 0) if kept else (12, 1))
+
+
 def test_a_mesh_without_floaters_stays_itself() -> None:
     second = ball(0.1, (3, 0, 0), 2)  # far away, and too large for a floater
     for mesh in (BODY, joined(BODY, second)):

@@ -14,9 +14,11 @@ from advtex_engine.mesh.pieces import pieces
 from advtex_options.box import Box
 
 # Real pieces of five scans have .7 % of the surface and 1,500 faces at least. What is smaller than this share of it is
-# a floater if it has few faces, or nothing larger near it.
+# a floater if it has few faces and is short, or if nothing larger is near it: a mesh that was drawn, or has as few
+# faces as a phone's, has longer things of few faces, such as the rails of a chair.
 FLOATER_AREA = 0.001
 FLOATER_FACES = 100
+FLOATER_LENGTH = 0.2  # metres
 FLOATER_DISTANCE = 0.3  # metres
 MOST_PLACES = 500  # along a side, where a drawn mesh has faces of hundreds of metres
 SAMPLES = 16  # vertices of a piece whose distances are looked at
@@ -53,7 +55,7 @@ def crop(mesh: Mesh, box: Box, up_axis: str) -> Mesh:
 
 
 def drop_floaters(mesh: Mesh) -> tuple[Mesh, int]:
-    """The mesh without small pieces of few faces or far from all else, and how many went.
+    """The mesh without small pieces that are crumbs or far from all else, and how many went.
 
     Without any, the mesh is returned as it is.
     """
@@ -65,13 +67,21 @@ def drop_floaters(mesh: Mesh) -> tuple[Mesh, int]:
     area = torch.zeros(len(names), dtype=torch.float64)
     area.index_add_(0, piece, torch.linalg.cross(b - a, c - a).norm(dim=1) / 2)
     small = area < FLOATER_AREA * area.sum()
-    floats = small & (faces < FLOATER_FACES)
+    length = (_extremes(mesh, piece, "amax") - _extremes(mesh, piece, "amin")).norm(dim=1)
+    floats = small & (faces < FLOATER_FACES) & (length < FLOATER_LENGTH)
     unsure = (small & ~floats).nonzero()[:, 0].tolist()
     body = _places(mesh, ~small[piece]) if unsure else mesh.v_pos[:0]
     for number in unsure:
         corners = torch.unique(mesh.t_pos_idx[piece == number])
         floats[number] = _distance(mesh.v_pos[corners[:: -(-len(corners) // SAMPLES)]], body) > FLOATER_DISTANCE
     return keep_faces(mesh, ~floats[piece]), int(floats.sum())
+
+
+def _extremes(mesh: Mesh, piece: Tensor, which: str) -> Tensor:
+    """[N,3]: the highest or lowest coordinates of the pieces of its faces [T]."""
+    corners, of_corner = mesh.v_pos[mesh.t_pos_idx].view(-1, 3), piece.repeat_interleave(3)[:, None].expand(-1, 3)
+    empty = corners.new_zeros((int(piece.max()) + 1, 3))
+    return empty.scatter_reduce(0, of_corner, corners, which, include_self=False)
 
 
 def _places(mesh: Mesh, kept: Tensor) -> Tensor:

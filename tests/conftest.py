@@ -8,14 +8,17 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import psycopg
 import pytest
 import redis
+from hypothesis import settings
 
 from advtex_server.embedded import free_port
 from advtex_store.blobs import Blobs
@@ -25,6 +28,10 @@ from advtex_store.places import open_blobs
 # A shell's background command is started with Ctrl-C ignored, and its children inherit that; some tests send it.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# How long an example takes says how busy the machine is.
+settings.register_profile("no deadline", deadline=None)
+settings.load_profile("no deadline")
 
 
 def load(path: Path) -> ModuleType:
@@ -151,11 +158,20 @@ def database_url(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture(scope="session")
 def _s3_endpoint() -> Iterator[str]:
+    from moto.s3.responses import S3Response
     from moto.server import ThreadedMotoServer
+
+    put, one_by_one = S3Response.put_object, threading.Lock()
+
+    def put_object(self: S3Response) -> Any:
+        with one_by_one:  # S3 decides at once whether an object is there already; moto looks, and then writes
+            return put(self)
 
     server = ThreadedMotoServer("127.0.0.1", free_port(), verbose=False)
     server.start()
-    yield f"http://127.0.0.1:{server._port}"
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(S3Response, "put_object", put_object)
+        yield f"http://127.0.0.1:{server._port}"
     server.stop()
 
 

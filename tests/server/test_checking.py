@@ -218,11 +218,12 @@ def test_a_server_that_stops_leaves_its_checks_to_others_at_once(
         sleeping(patched)
         job = first.http.post("/v1/jobs", json={"upload_id": first.upload(scan_zip.read_bytes())}).json()["id"]
         wait_until(check_pids)
+    checks = check_pids()
     second = make_live(lease_seconds=600.0)
     time.sleep(0.5)
     assert second.http.get(f"/v1/jobs/{job}").json()["state"] == "checking", "it is the first one's"
     first.stop()
-    assert check_pids() == []
+    assert not set(checks) & set(check_pids()), "the second one's may run already"
     assert second.checked(job)["state"] == "queued"
 
 

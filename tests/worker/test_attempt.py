@@ -239,18 +239,25 @@ def test_a_refusal_that_stays_ends_the_job_with_its_reason_after_a_while(
 ) -> None:
     monkeypatch.setattr("advtex_worker.patience.RETRY_SECONDS", 0.5)
 
+    tried, seen = list[float](), threading.Event()
+
     def refused(*_: Any) -> None:
+        if tried:
+            seen.wait(60)
+        tried.append(time.monotonic())
         raise refusal
 
     monkeypatch.setattr("advtex_worker.attempt.Attempt._fetch_scan", refused)
     job_id = new_job()
-    given = Host(settings.model_copy(update={"refused_seconds": 2.0}), engine="fake_engines:quick")
+    given = Host(settings.model_copy(update={"refused_seconds": 0.1}), engine="fake_engines:quick")
     thread = in_background(given, job_id)
     wait_until(lambda: "cannot use the storage" in store.records.job(job_id).waiting_reason)
     row = store.records.job(job_id)
     assert row.state == JobState.running
     assert str(refusal)[:40] in row.waiting_reason
+    seen.set()
     thread.join()
+    assert len(tried) == 2
     row = store.records.job(job_id)
     assert (row.state, row.attempt) == (JobState.failed, 1)
     assert row.error is not None

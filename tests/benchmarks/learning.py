@@ -8,6 +8,7 @@ guessing, all by one that knows everything. Each option changes one thing of the
 the examples that it is shown; told apart are the patches since the reading before. With --seeds it begins as often,
 each time from other weights, and the least of the seeds says whether one collapsed. With --elsewhere it learns for
 --steps on every other scan, by turns, and is then asked about a scan that it has never seen, and learns nothing there.
+Projected features are AlexNet's: their weights lie in $ADVTEX_LPIPS_WEIGHTS.
 
 Writes learning.json (a cell per scan, option and seed) and learning.md below --results; goes on with missing cells when
 started again.
@@ -17,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import statistics
 import tempfile
 from collections.abc import Sequence
@@ -29,12 +31,13 @@ from harness import RESULTS, Results, Stopwatch, markdown_table, parsed_size, pr
 from paper import HOLDOUT, SCAN_FACES
 from torch import Tensor, nn
 
-from advtex_engine.adversarial.discriminator import STRIDES, PatchDiscriminator
+from advtex_engine.adversarial.discriminator import PATCH_STRIDE, STRIDES, PatchDiscriminator
 from advtex_engine.adversarial.game import knowledge
 from advtex_engine.adversarial.optimizer import AdversarialOptimizer, Losses
 from advtex_engine.core.config import TextureConfig, resolve_preset
 from advtex_engine.methods import MethodInput
 from advtex_engine.methods.adversarial import pairs_of
+from advtex_engine.metrics.lpips import load_features
 from advtex_engine.runtime.devices import choose_device
 
 SHARES = (0.1, 0.25, 0.5, 1.0)
@@ -128,6 +131,29 @@ class Augmented(Both):
         return logits.flip(flipped), features
 
 
+class Projected(PatchDiscriminator):
+    """Sees both images as the first two layers of AlexNet do, which stand still (Sauer et al. 2021)."""
+
+    def __init__(self, generator: torch.Generator) -> None:
+        super().__init__(generator)
+        self.seen = [load_features("alexnet")]  # in a list: no part of what learns
+        channels = (2 * (64 + 192), 128, 128, 1)
+        self.convolutions = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1) for a, b in itertools.pairwise(channels))
+        for layer in self.convolutions:
+            nn.init.kaiming_normal_(layer.weight, SLOPE, generator=generator)  # type: ignore[arg-type]
+
+    def examine(self, x: Tensor, parameters: Sequence[Tensor] | None = None) -> tuple[Tensor, list[Tensor]]:
+        given = list(self.parameters() if parameters is None else parameters)
+        condition, residual = x[:, :3].float(), x[:, 3:6].float()
+        fine, coarse = self.seen[0](torch.cat((condition, condition + residual)))[:2]
+        both = torch.cat((F.avg_pool2d(fine, 2), F.interpolate(coarse, [side // 2 for side in fine.shape[-2:]])), 1)
+        y = torch.cat(both.chunk(2), 1).to(given[0].dtype)
+        for weight, bias in zip(given[:-2:2], given[1:-2:2], strict=True):
+            y = F.leaky_relu(F.conv2d(y, weight, bias, padding=1), SLOPE)
+        logits = F.conv2d(y, given[-2], given[-1], padding=1)
+        return F.interpolate(logits, [side // PATCH_STRIDE - 2 for side in x.shape[-2:]], mode="bilinear"), []
+
+
 class Watched(Both):
     """Keeps the last example, which is the real one, and its logits."""
 
@@ -183,6 +209,7 @@ OPTIONS = {
     "both, instance normalization": Option(Instance),
     "both, two scales": Option(TwoScales),
     "both, augmented": Option(Augmented),
+    "projected features": Option(Projected),
     "both, R1": Option(Watched, Penalized),
     "both, four crops a step": Option(optimizer=SeveralCrops),
     "both, examples not aligned": Option(preset={**SLOW, "alignment": False}),

@@ -89,7 +89,8 @@ def test_scans_are_put_together_by_geometric_means() -> None:
     assert harness.geometric_means("method", {"mean": [cell(0.1, 0.01)]}) == ""
 
 
-def test_every_way_to_learn_is_tried(tmp_path: Path) -> None:
+def test_every_way_to_learn_is_tried(tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ADVTEX_LPIPS_WEIGHTS", str(weights))
     synthesize(tmp_path / "desk", views=18, width=96, height=64)
     line = [str(tmp_path / "desk"), "--scan-size", "96x64", "--steps", "10", "--device", "cpu"]
     for seeds in ("1", "1"):  # the second time nothing is missing

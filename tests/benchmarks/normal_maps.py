@@ -19,9 +19,8 @@ import torch
 import torch.nn.functional as F
 
 from advtex_engine.atlas.build import new_atlas
-from advtex_engine.atlas.density import face_areas
 from advtex_engine.core.monitor import Monitor
-from advtex_engine.core.scene import Camera, Mesh
+from advtex_engine.core.scene import Camera, Mesh, face_areas
 from advtex_engine.mesh.clean import clean, decimate
 from advtex_engine.mesh.detail import Detail, find_detail
 from advtex_engine.mesh.models import load_reference

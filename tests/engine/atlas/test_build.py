@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 
 from advtex_engine.atlas.build import SIZE_STEP, build_atlas, texel_coverage, why_not_kept
 from advtex_engine.atlas.charting import PADDING, Charts, make_charts
-from advtex_engine.atlas.density import face_areas, pixel_density
+from advtex_engine.atlas.density import pixel_density
 from advtex_engine.core.config import TextureConfig
 from advtex_engine.core.errors import OptionError, Problem, ScanError
 from advtex_engine.core.monitor import Monitor
-from advtex_engine.core.scene import Mesh
+from advtex_engine.core.scene import Mesh, face_areas
 from advtex_engine.mesh.clean import clean
 
 

@@ -292,14 +292,37 @@ def test_a_seam_costs_what_the_views_differ_along_it() -> None:
 def test_faces_that_nobody_sees_have_no_view_and_hold_up_nobody() -> None:
     color = torch.zeros((2, 2, POINTS, 3), dtype=torch.uint8)
     faces, candidates = two_faces([[-1, -1], [3, -1]], color)
-    found = assign_views(faces, candidates)
+    found = assign_views(Mesh(torch.rand(4, 3), faces), candidates)
     assert found.view.tolist() == [-1, 3]
     assert found.agreement[1] == 1
+
+
+def test_a_face_of_no_area_is_painted_by_who_sees_it() -> None:
+    """The empty place beside it would have the neighbor's color, and so the cheaper seam."""
+    color = torch.zeros((2, 2, POINTS, 3), dtype=torch.uint8)
+    color[1, 0] = 200
+    faces, candidates = two_faces([[5, -1], [3, -1]], color)
+    position = torch.tensor([[0.0, 1, 0], [0, 0, 0], [2, 0, 0], [1, 0, 0]])
+    assert assign_views(Mesh(position, faces), candidates).view.tolist() == [5, 3]
 
 
 def test_one_face_alone() -> None:
     color = torch.zeros((1, 2, POINTS, 3), dtype=torch.uint8)
     candidates = Candidates(torch.tensor([[4, 2]]), torch.tensor([[1.0, 0.5]]), torch.zeros((1, 2)), color)
-    assert assign_views(torch.tensor([[0, 1, 2]]), candidates).view.tolist() == [2]
+    assert assign_views(Mesh(torch.eye(3), torch.tensor([[0, 1, 2]])), candidates).view.tolist() == [2]
     none = torch.zeros((0, 2), dtype=torch.int64)
     assert torch.equal(face_adjacency(torch.tensor([[0, 1, 2]])).face, Adjacency(none, none).face)
+
+
+@pytest.mark.parametrize("cuts", [1, 2, 8])
+def test_who_paints_a_door_does_not_depend_on_how_it_is_cut_into_faces(cuts: int) -> None:
+    """View 0 shows the wall, and the door a little worse than view 1 does, which is worth a seam all around."""
+    half = torch.linspace(0.5, 1.5, 9)
+    line = torch.cat((-half.flip(0), torch.linspace(-0.5, 0.5, cuts + 1)[1:-1], half))
+    y, x = torch.meshgrid(line, line, indexing="ij")
+    position, (_, faces) = torch.stack((x, y, torch.zeros_like(x)), 2).view(-1, 3), grid(len(line) - 1)
+    door = position[faces].mean(1).abs().amax(1) < 0.5
+    cost = torch.where(door[:, None], torch.tensor([5.0, 0.0]), torch.tensor([0.0, 5.0]))
+    view, color = torch.tensor([0, 1]).repeat(len(faces), 1), torch.zeros((len(faces), 2, POINTS, 3), dtype=torch.uint8)
+    found = assign_views(Mesh(position, faces), Candidates(view, cost, torch.zeros_like(cost), color))
+    assert torch.equal(found.view, door.long())

@@ -12,11 +12,11 @@ import torch
 
 from advtex_engine.atlas.chart_cache import ChartMaker
 from advtex_engine.atlas.charting import PADDING, Charts, Floats, Integers, make_charts, pack_charts
-from advtex_engine.atlas.density import face_areas, pixel_density
+from advtex_engine.atlas.density import pixel_density
 from advtex_engine.core.config import TextureConfig
 from advtex_engine.core.errors import OptionError, Problem, ScanError
 from advtex_engine.core.monitor import Monitor
-from advtex_engine.core.scene import Atlas, Camera, Mesh
+from advtex_engine.core.scene import Atlas, Camera, Mesh, face_areas
 
 # The texture's sides are multiples of this, so that coarse levels of a pyramid divide them.
 SIZE_STEP = 64

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from advtex_engine.core.scene import Camera, Mesh
+from advtex_engine.core.scene import Camera, Mesh, face_areas
 
 # Of more cameras an even selection is measured: quantiles over views change little, and memory stays bounded.
 MAX_CAMERAS = 160
@@ -20,13 +20,6 @@ VIEW_QUANTILE = 0.9
 # Visibility is decided on a coarse depth buffer of points: cells of this many pixels, and relative depth tolerance.
 CELL_PIXELS = 8
 DEPTH_TOLERANCE = 0.1
-
-
-def face_areas(mesh: Mesh) -> Tensor:
-    """[T] float64, square metres."""
-    a, b, c = mesh.v_pos.double()[mesh.t_pos_idx].unbind(1)
-    area: Tensor = torch.linalg.vector_norm(torch.linalg.cross(b - a, c - a), dim=1) / 2
-    return area
 
 
 def pixel_density(mesh: Mesh, cameras: Sequence[Camera]) -> Tensor:

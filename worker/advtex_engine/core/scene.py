@@ -96,6 +96,13 @@ class Mesh:
         return Mesh(self.v_pos.to(device), self.t_pos_idx.to(device), *(uv or ()))
 
 
+def face_areas(mesh: Mesh) -> Tensor:
+    """[T] float64, square metres."""
+    a, b, c = mesh.v_pos.double()[mesh.t_pos_idx].unbind(1)
+    area: Tensor = torch.linalg.vector_norm(torch.linalg.cross(b - a, c - a), dim=1) / 2
+    return area
+
+
 @dataclass(frozen=True)
 class Atlas:
     """A mesh with an injective parameterization and the texture's size in texels.

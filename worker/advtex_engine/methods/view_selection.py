@@ -49,7 +49,7 @@ def select_views(given: MethodInput) -> Selection:
     tolerance = DEPTH_TOLERANCE[given.scene.kind] * OCCLUSION_SHARE
     candidates = find_candidates(mesh, maps, tolerance)
     candidates = replace(candidates, cost=candidates.cost + blur_cost(mesh, candidates, maps, given.means[1]))
-    assignment = assign_views(mesh.t_pos_idx, candidates)
+    assignment = assign_views(mesh, candidates)
     texels = map_texels(atlas)
     blend = blend_texels(mesh, texels, assignment.view, candidates.view, Sampler(maps, tolerance))
     own = torch.where(blend.known, assignment.view[texels.face], -1)

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from advtex_engine.atlas.build import SIZE_STEP, new_atlas
-from advtex_engine.atlas.density import face_areas
 from advtex_engine.core.monitor import Monitor
-from advtex_engine.core.scene import Atlas, Mesh
+from advtex_engine.core.scene import Atlas, Mesh, face_areas
 from advtex_engine.mesh.clean import decimate
 from advtex_engine.mesh.closest import ClosestPoints
 from advtex_engine.mesh.tangents import TangentFrames

@@ -10,8 +10,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from advtex_engine.atlas.density import face_areas
-from advtex_engine.core.scene import Mesh
+from advtex_engine.core.scene import Mesh, face_areas
 from advtex_engine.mesh.normals import vertex_normals
 from advtex_engine.results.baking import TexturedModel
 

@@ -9,10 +9,9 @@ from pathlib import Path
 
 from torch import Tensor
 
-from advtex_engine.atlas.density import face_areas
 from advtex_engine.core.errors import OptionError, Problem
 from advtex_engine.core.monitor import Monitor
-from advtex_engine.core.scene import Atlas
+from advtex_engine.core.scene import Atlas, face_areas
 from advtex_engine.results.baking import TexturedModel, smaller
 from advtex_engine.results.export import write_glb
 

@@ -22,8 +22,7 @@ from torch import Tensor
 
 from advtex_engine.atlas.build import covered_share
 from advtex_engine.atlas.charting import split_faces
-from advtex_engine.atlas.density import face_areas
-from advtex_engine.core.scene import Atlas, Mesh
+from advtex_engine.core.scene import Atlas, Mesh, face_areas
 from advtex_engine.mesh.borders import median_edge
 from advtex_engine.mesh.closest import ClosestPoints
 from advtex_engine.mesh.detail import Detail

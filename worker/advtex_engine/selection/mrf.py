@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from advtex_engine.core.scene import Mesh, face_areas
 from advtex_engine.selection.candidates import NO_VIEW, Candidates
 
-SEAM_COST = 2.0  # of any seam, in units of the data term
+SEAM_COST = 4.0  # of any seam of mean length, in units of the data term of a face of mean area
 COLOR_COST = 0.1  # difference in color, of 1, that costs as much as SEAM_COST once more
 MAX_COLOR_COST = 3.0
 MESSAGE_ROUNDS = 30
@@ -149,16 +150,38 @@ class Assignment:
     agreement: Tensor
 
 
-def assign_views(t_pos_idx: Tensor, candidates: Candidates) -> Assignment:
-    """One view per face, of least total energy."""
+def assign_views(mesh: Mesh, candidates: Candidates) -> Assignment:
+    """One view per face, of least total energy.
+
+    Data terms count by their face's area and seams by their length, over the means, so that it does not matter how
+    finely the surface is cut: else a door of a few large faces is painted by a far view, to save a seam of two edges.
+    """
+    t_pos_idx = mesh.t_pos_idx
     adjacency = face_adjacency(t_pos_idx)
     seen = (candidates.view >= 0).any(1)
     both = seen[adjacency.face].all(1)
     adjacency = Adjacency(adjacency.face[both], adjacency.side[both])
     pairwise = seam_costs(t_pos_idx, candidates, adjacency)
+    pairwise *= _over_mean(edge_lengths(mesh, adjacency))[:, None, None]
     cost = candidates.cost + candidates.disagreement
     # Costs are relative to the face's best: what all views of a face share decides nothing.
-    unary = (cost - cost.amin(1, keepdim=True)).clamp(max=NO_VIEW)
+    area = face_areas(mesh)
+    share = _over_mean(area, area[seen])
+    unary = (cost - cost.amin(1, keepdim=True)) * share[:, None]
+    unary.masked_fill_(candidates.view < 0, NO_VIEW * float(share.amax().clamp(min=1)))  # however small the face is
     choice = solve(unary, adjacency.face, pairwise)[:, None]
     agreement = torch.exp(-candidates.disagreement.gather(1, choice)[:, 0])
     return Assignment(candidates.view.gather(1, choice)[:, 0], agreement)
+
+
+def edge_lengths(mesh: Mesh, adjacency: Adjacency) -> Tensor:
+    """[E] metres."""
+    ends = mesh.t_pos_idx[adjacency.face[:, :1], edge_ends(mesh.t_pos_idx, adjacency, 0)]
+    lengths: Tensor = torch.linalg.vector_norm(mesh.v_pos[ends[:, 0]] - mesh.v_pos[ends[:, 1]], dim=1)
+    return lengths
+
+
+def _over_mean(measure: Tensor, counted: Tensor | None = None) -> Tensor:
+    """[N] float32: sizes over the mean of those that are counted."""
+    mean: Tensor = (measure if counted is None else counted).mean()
+    return (measure / mean).float()

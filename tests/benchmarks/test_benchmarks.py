@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,7 @@ import torch
 
 import examples
 from advtex_engine.adversarial.discriminator import PatchDiscriminator
+from advtex_engine.core.config import TextureConfig
 from advtex_engine.metrics.lpips import NETWORKS
 from advtex_engine.synthetic import patches
 from advtex_engine.synthetic.real import drawn_scene
@@ -49,6 +52,37 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.save(table, folder / "alexnet-owt-7be5be79.pth")
     torch.save(heads, folder / "alex.pth")
     return folder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_held_out() -> Iterator[None]:
+    """Synthetic scans have as many true views to be scored against as the one that is shown needs."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("advtex_engine.synthetic.scan.HELDOUT_VIEWS", harness.SHOWN_VIEW + 1)
+        yield
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scan for all that only read it: 18 views, enough to hold every eighth out and to have pairs of the others."""
+    folder = tmp_path_factory.mktemp("scan") / "desk"
+    synthesize(folder, views=18, width=96, height=64)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def small_desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same of 6 views."""
+    folder = tmp_path_factory.mktemp("small-scan") / "desk"
+    synthesize(folder, views=6, width=96, height=64)
+    return folder
+
+
+@pytest.fixture
+def unrefined(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scans for `learning` with the errors that they have, and small meshes: nothing is asked of how they are made."""
+    monkeypatch.setattr(learning, "TextureConfig", partial(TextureConfig, refine=False))
+    monkeypatch.setattr(learning, "SCAN_FACES", 600)
 
 
 def test_results_survive_and_cells_are_found_by_all_their_settings(tmp_path: Path) -> None:
@@ -89,10 +123,12 @@ def test_scans_are_put_together_by_geometric_means() -> None:
     assert harness.geometric_means("method", {"mean": [cell(0.1, 0.01)]}) == ""
 
 
-def test_every_way_to_learn_is_tried(tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("unrefined")
+def test_every_way_to_learn_is_tried(
+    desk: Path, tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("ADVTEX_LPIPS_WEIGHTS", str(weights))
-    synthesize(tmp_path / "desk", views=18, width=96, height=64)
-    line = [str(tmp_path / "desk"), "--scan-size", "96x64", "--steps", "10", "--device", "cpu"]
+    line = [str(desk), "--scan-size", "96x64", "--steps", "10", "--device", "cpu"]
     for seeds in ("1", "1"):  # the second time nothing is missing
         learning.main([*line, "--seeds", seeds, "--results", str(tmp_path / "out")])
     cells = json.loads((tmp_path / "out" / "learning.json").read_text())["cells"]
@@ -103,10 +139,11 @@ def test_every_way_to_learn_is_tried(tmp_path: Path, weights: Path, monkeypatch:
     assert all(f"| {option} |" in page for option in learning.OPTIONS)
 
 
-def test_what_is_learned_elsewhere_is_asked_of_a_scan_that_was_not_seen(tmp_path: Path) -> None:
-    scans = [tmp_path / name for name in ("desk", "shelf", "room")]
-    for seed, scan in enumerate(scans):
-        synthesize(scan, views=18, width=96, height=64, seed=seed)
+@pytest.mark.usefixtures("unrefined")
+def test_what_is_learned_elsewhere_is_asked_of_a_scan_that_was_not_seen(desk: Path, tmp_path: Path) -> None:
+    scans = [desk, tmp_path / "shelf", tmp_path / "room"]
+    for error, scan in zip((0.005, 0.01), scans[1:], strict=True):
+        synthesize(scan, views=18, width=96, height=64, camera_error=error)  # one object is built once
     line = [*map(str, scans), "--scan-size", "96x64", "--steps", "3", "--device", "cpu", "--options", "both"]
     learning.main([*line, "--elsewhere", "--results", str(tmp_path / "out")])
     cells = json.loads((tmp_path / "out" / "learning.json").read_text())["cells"]
@@ -225,13 +262,14 @@ def test_parts_switch_off_what_is_there() -> None:
 
 
 @pytest.mark.slow
-def test_each_part_is_switched_off_once(tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    synthesize(tmp_path / "desk", views=6, width=64, height=64)
+def test_each_part_is_switched_off_once(
+    small_desk: Path, tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(parts, "HOLDOUT", 3)
     monkeypatch.setattr(parts, "SCAN_FACES", 600)
     some = (*parts.SHOWN, "view selection without refined geometry", "without refined cameras")
     monkeypatch.setattr(parts, "VARIANTS", {name: parts.VARIANTS[name] for name in some})
-    line = [str(tmp_path / "desk"), *SMALL, "--models", "1", "--lpips-weights", str(weights)]
+    line = [str(small_desk), *SMALL, "--models", "1", "--lpips-weights", str(weights)]
     line += ["--results", str(tmp_path)]
     parts.main(line)
     page = (tmp_path / "parts.md").read_text()
@@ -244,9 +282,10 @@ def test_each_part_is_switched_off_once(tmp_path: Path, weights: Path, monkeypat
 
 
 @pytest.mark.slow
-def test_methods_are_compared_on_a_scan(tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    synthesize(tmp_path / "desk", views=6, width=96, height=64)
-    line = [str(tmp_path / "desk"), "--size", "96x64", "--holdout", "3", "--steps", "2", "--device", "cpu"]
+def test_methods_are_compared_on_a_scan(
+    small_desk: Path, tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = [str(small_desk), "--size", "96x64", "--holdout", "3", "--steps", "2", "--device", "cpu"]
     line += ["--methods", "mean", "view_selection", "--lpips-weights", str(weights), "--results", str(tmp_path / "out")]
     scans.main(line)
     found = json.loads((tmp_path / "out" / "scans.json").read_text())["cells"]
@@ -288,12 +327,11 @@ def test_compiled_steps_are_timed_beside_the_plain_one(tmp_path: Path, monkeypat
 
 @pytest.mark.slow
 def test_the_paper_s_method_stands_beside_its_peers_and_its_suspects(
-    tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
+    small_desk: Path, tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    synthesize(tmp_path / "desk", views=6, width=96, height=64)
     for name, value in {"SIZE": "64x64", "VIEWS": 6, "FACES": 600, "SCAN_FACES": 600, "HOLDOUT": 3}.items():
         monkeypatch.setattr(paper, name, value)
-    line = [str(tmp_path / "desk"), "--scan-size", "96x64", "--errors", "geometry", "--levels", "1", "--steps", "2"]
+    line = [str(small_desk), "--scan-size", "96x64", "--errors", "geometry", "--levels", "1", "--steps", "2"]
     coded = [f"from the mean, {how}" for how in ("in float32", "a tenth of theta_z", "fake without holes")]
     changed = ["from the mean", "from the mean, fewer texels", *coded]
     line += ["--rows", "l1", "view_selection", "adversarial", *changed, "--device", "cpu"]
@@ -318,12 +356,13 @@ def test_the_paper_s_method_stands_beside_its_peers_and_its_suspects(
 
 
 @pytest.mark.slow
-def test_the_game_ends_where_the_run_ends(tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    synthesize(tmp_path / "desk", views=6, width=96, height=64)
+def test_the_game_ends_where_the_run_ends(
+    small_desk: Path, tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for module in (paper, game):
         for name, value in {"SIZE": "64x64", "VIEWS": 6, "FACES": 600, "SCAN_FACES": 600, "HOLDOUT": 3}.items():
             monkeypatch.setattr(module, name, value)
-    line = [str(tmp_path / "desk"), "--scan-size", "96x64", "--errors", "--steps", "4"]
+    line = [str(small_desk), "--scan-size", "96x64", "--errors", "--steps", "4"]
     line += ["--device", "cpu", "--lpips-weights", str(weights)]
     paper.main([*line, "--rows", "adversarial", "--results", str(tmp_path / "paper")])
     changed = ["--change", "start=selection", "lr_texture=1e-2"]
@@ -360,9 +399,8 @@ def test_the_state_that_is_kept_is_the_best_before_patience_is_over() -> None:
 
 
 @pytest.mark.slow
-def test_probes_stand_beside_views_that_a_run_never_sees(tmp_path: Path, weights: Path) -> None:
-    synthesize(tmp_path / "desk", views=18, width=96, height=64)
-    line = [str(tmp_path / "desk"), "--synthetic", "geometry", "--views", "8", "--scan-size", "96x64", "--faces", "600"]
+def test_probes_stand_beside_views_that_a_run_never_sees(desk: Path, tmp_path: Path, weights: Path) -> None:
+    line = [str(desk), "--synthetic", "geometry", "--views", "8", "--scan-size", "96x64", "--faces", "600"]
     line += ["--steps", "8", "--turn", "3", "--no-refine", "--device", "cpu"]
     probes.main([*line, "--lpips-weights", str(weights), "--results", str(tmp_path / "out")])
     cells = json.loads((tmp_path / "out" / "probes.json").read_text())["cells"]
@@ -377,10 +415,9 @@ def test_probes_stand_beside_views_that_a_run_never_sees(tmp_path: Path, weights
     assert "## desk, 96x64, standard, 8 steps in turns of 3, seed 0, cameras as they are" in page
 
 
-def test_losses_are_compared_one_by_one(tmp_path: Path, weights: Path) -> None:
+def test_losses_are_compared_one_by_one(desk: Path, tmp_path: Path, weights: Path) -> None:
     before = dict(vars(losses.gabor))
-    synthesize(tmp_path / "desk", views=18, width=96, height=64)
-    line = [str(tmp_path / "desk"), "--scan-size", "96x64", "--faces", "600", "--steps", "4", "--device", "cpu"]
+    line = [str(desk), "--scan-size", "96x64", "--faces", "600", "--steps", "4", "--device", "cpu"]
     line += ["--no-refine"]
     names = ["start", "l1", "ssim", "untrained discriminator", "gabor", "no maximum", "4 orientations"]
     for _ in range(2):  # the second time nothing is missing
@@ -397,8 +434,9 @@ def test_real_examples_are_as_far_from_their_sources_as_the_scan_s_errors(
     tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(examples, "LEAST_PIXELS", 500)
+    monkeypatch.setattr(examples, "SCAN_FACES", 2000)
     for name, error in (("exact", 0.0), ("off", 0.02)):
-        synthesize(tmp_path / name, views=30, width=96, height=72, camera_error=error, geometry_error=0.0)
+        synthesize(tmp_path / name, views=18, width=96, height=72, camera_error=error, geometry_error=0.0)
     line = [str(tmp_path / "exact"), str(tmp_path / "off"), "--scan-size", "96x72", "--errors", "--pairs", "8"]
     line += ["--device", "cpu", "--lpips-weights", str(weights), "--results", str(tmp_path / "out")]
     examples.main(line)

@@ -29,7 +29,14 @@ from advtex_engine.synthetic.scan import synthesize
 KNOWN = Path(__file__).with_name("work_format.json")
 CONFIGS = {
     method: TextureConfig(
-        preset="preview", method=method, steps=6, size=(96, 72), face_budget=800, max_texture_size=256, device="cpu"
+        preset="preview",
+        method=method,
+        steps=6,
+        size=(96, 72),
+        face_budget=800,
+        max_texture_size=256,
+        device="cpu",
+        outputs="glb",
     )
     for method in ("adversarial", "l1")
 }
@@ -52,6 +59,13 @@ class StopsAtTwo(Monitor):
 class Listens(StopsAtTwo):
     def stop_requested(self) -> bool:
         return False
+
+
+@pytest.fixture(autouse=True)
+def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing of a work folder goes into previews but what the model is made of, too."""
+    for name in ("write_gallery", "write_page"):
+        monkeypatch.setattr(f"advtex_engine.pipeline.{name}", lambda *_: ())
 
 
 @pytest.fixture(scope="module")

@@ -158,6 +158,7 @@ def database_url(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture(scope="session")
 def _s3_endpoint() -> Iterator[str]:
+    from moto import backends
     from moto.s3.responses import S3Response
     from moto.server import ThreadedMotoServer
 
@@ -171,6 +172,8 @@ def _s3_endpoint() -> Iterator[str]:
     server.start()
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(S3Response, "put_object", put_object)
+        modules = list(backends.list_of_moto_modules())  # moto looks for them on the disk at every request
+        patched.setattr(backends, "list_of_moto_modules", lambda: modules)
         yield f"http://127.0.0.1:{server._port}"
     server.stop()
 

@@ -264,15 +264,12 @@ def test_a_look_costs_no_more_with_thousands_of_batches(sqlite_bench: Any) -> No
     fill(bench, bench.finished_upload(), jobs)
 
     def seconds(gaze: Gaze | None) -> float:
-        took = []
-        for _ in range(15):
-            began = time.perf_counter()
-            with bench.database.read() as session:
-                assert len(next_jobs(session, 20, bench.clock.now, 5, (), gaze)) == 20
-            took.append(time.perf_counter() - began)
-        return min(took)
+        began = time.thread_time()  # the processor's: SQLite works in this thread
+        with bench.database.read() as session:
+            assert len(next_jobs(session, 20, bench.clock.now, 5, (), gaze)) == 20
+        return time.thread_time() - began
 
-    bounded, whole = seconds(Gaze()), seconds(None)
+    bounded, whole = map(min, zip(*((seconds(Gaze()), seconds(None)) for _ in range(15)), strict=True))
     assert bounded < 0.7 * whole, f"{1e3 * bounded:.1f} ms, {1e3 * whole:.1f} ms for all lines"
 
 

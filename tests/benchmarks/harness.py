@@ -31,6 +31,7 @@ from advtex_engine.atlas.build import build_atlas
 from advtex_engine.core.config import TextureConfig, resolve_preset
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Atlas, Camera, Mesh, View
+from advtex_engine.coverage import complete_texture
 from advtex_engine.ingest.read import ingest
 from advtex_engine.mesh.clean import clean, decimate
 from advtex_engine.mesh.models import load_model
@@ -44,7 +45,6 @@ from advtex_engine.previews.live import Live
 from advtex_engine.refine.run import apply_refinement, refine_scene
 from advtex_engine.render.pictures import contact_sheet
 from advtex_engine.render.render_view import render_layers, render_view
-from advtex_engine.render.texture import fill_holes
 from advtex_engine.render.view_maps import build_view_maps
 from advtex_engine.results.export import export_model
 from advtex_engine.runtime.checkpoint import WorkFolder
@@ -138,8 +138,12 @@ def on_cpu(atlas: Atlas) -> Atlas:
 
 
 def run_method(given: MethodInput, method: str) -> Tensor:
-    """The method's texture [H,W,3] on the CPU, from the start: what an earlier method left behind is cleared."""
+    """The method's texture [H,W,3] on the CPU, from the start: what an earlier method left behind is cleared.
+
+    What no photograph shows is guessed from the surface beside it, as in a run.
+    """
     given.work.clear()
+    given = dataclasses.replace(given, facts={})
     record = known_methods()[method]
     if record.starts_selected:
         preset = dataclasses.replace(given.preset, start="selection", toned=True)
@@ -148,7 +152,8 @@ def run_method(given: MethodInput, method: str) -> Tensor:
         given = started(given)
     given = dataclasses.replace(given, config=dataclasses.replace(given.config, method=method))
     texture, _ = texture_function(method)(given)
-    return fill_holes(texture, given.maps[1].slot_map >= 0).cpu()
+    touched = given.maps[1].slot_map >= 0
+    return complete_texture(given.atlas, texture, touched & given.facts.get("known", touched)).texture.cpu()
 
 
 def started(given: MethodInput) -> MethodInput:

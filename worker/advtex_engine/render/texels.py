@@ -17,6 +17,7 @@ from advtex_engine.core.scene import Atlas, Camera, Mesh
 from advtex_engine.render.rasterize import rasterize
 
 REACH = 2  # texels; the padding that charts have
+STEP = 0.5  # texels between the places at which the texels under a thin face are looked for
 # A texel outside its face is extrapolated, that of a sliver by no more than this (a corner has 2/3).
 MAX_FROM_CENTROID = 5 / 3
 
@@ -45,12 +46,13 @@ def map_texels(atlas: Atlas) -> TexelMap:
     camera = Camera(identity[:3, :3], identity, atlas.width, atlas.height)
     fragments = rasterize(Mesh(position, mesh.t_uv_idx), camera)
     inside = fragments.face_index.flatten() >= 0
-    face = _grow(fragments.face_index, REACH).flatten()
+    corners = position[:, :2][mesh.t_uv_idx]
+    face = _grow(_with_thin_parts(fragments.face_index, corners), REACH).flatten()
     texel = (face >= 0).nonzero()[:, 0]
     barycentric = fragments.barycentric.view(-1, 3)[texel]
     face = face[texel].long()
     outside = ~inside[texel]
-    corners = position[:, :2][mesh.t_uv_idx[face[outside]]].double()
+    corners = corners[face[outside]].double()
     center = torch.stack((texel[outside] % atlas.width, texel[outside] // atlas.width), 1) + 0.5
     barycentric[outside] = _barycentric(corners, center.double()).to(barycentric)
     return TexelMap(texel, face, barycentric)
@@ -63,6 +65,41 @@ def surface_points(mesh: Mesh, texels: TexelMap) -> Tensor:
     for side in (1, 2):
         points += mesh.v_pos[corner[:, side]] * texels.barycentric[:, side : side + 1]
     return points
+
+
+def _with_thin_parts(face: Tensor, corners: Tensor) -> Tensor:
+    """[H,W] with texels of nobody (-1) given to faces [T,3,2] that run over them, but not over their centers.
+
+    A chart of less than a texel's width, or a needle's end, would else have no texels, and be drawn in the color of
+    whatever lies beside it. Such faces are followed along their sides and from their corners to their middle.
+    """
+    height, width = face.shape
+
+    def texel_at(points: Tensor) -> Tensor:
+        column, row = points.long().unbind(-1)
+        return row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
+
+    marks = torch.cat((corners, corners.mean(1, keepdim=True)), 1)
+    places, drawn = texel_at(marks), torch.bincount(face[face >= 0].long(), minlength=len(corners)) > 0
+    out, far = ((owner.flatten()[places] < 0).any(1) for owner in (face, _grow(face, REACH - 1)))
+    thin = (out & (~drawn | (_heights(corners) < 1)) | far).nonzero()[:, 0]
+    start, end = marks[thin][:, [[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]]].flatten(0, 1).unbind(1)
+    steps = ((end - start).norm(dim=1) / STEP).ceil().long() + 1
+    line = torch.arange(len(steps), device=face.device).repeat_interleave(steps)
+    step = torch.arange(len(line), device=face.device) - (steps.cumsum(0) - steps)[line]
+    share = step / (steps[line] - 1).clamp(min=1)
+    texel = texel_at(torch.lerp(start[line], end[line], share[:, None]))
+    free = face.flatten()[texel] < 0
+    owner = thin[line[free] // 6].to(face.dtype)
+    return face.flatten().scatter_reduce(0, texel[free], owner, "amax").view_as(face)
+
+
+def _heights(corners: Tensor) -> Tensor:
+    """[T] of triangles [T,3,2] over their longest sides."""
+    sides = corners.roll(-1, 1) - corners
+    twice = (sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]).abs()
+    height: Tensor = twice / sides.norm(dim=2).amax(1).clamp(min=1e-9)
+    return height
 
 
 def _grow(face: Tensor, steps: int) -> Tensor:

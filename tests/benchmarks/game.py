@@ -31,6 +31,7 @@ from harness import (
     Results,
     Stopwatch,
     Truth,
+    completed,
     load_truth,
     markdown_table,
     needed_lpips,
@@ -56,7 +57,6 @@ from advtex_engine.methods.adversarial import pairs_of, rated
 from advtex_engine.methods.mean import dense_texture
 from advtex_engine.metrics.lpips import Lpips
 from advtex_engine.metrics.speckle import speckle_share
-from advtex_engine.render.texture import fill_holes
 from advtex_engine.runtime.devices import choose_device
 
 READINGS = 5
@@ -157,7 +157,7 @@ def play(
             found |= optimizer.gradient_norms()
         seconds = watch.seconds
         if end in ends:
-            texture = fill_holes(dense_texture(maps, optimizer.result).clamp(0, 1), maps.slot_map >= 0).cpu()
+            texture = completed(given, dense_texture(maps, optimizer.result).clamp(0, 1))
             found |= score(texture)
             found["speckle"] = speckle_share(texture, maps.slot_map.cpu() >= 0) or 0.0
         results.add({**settings, "step": end}, found, seconds)

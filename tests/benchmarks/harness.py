@@ -138,10 +138,7 @@ def on_cpu(atlas: Atlas) -> Atlas:
 
 
 def run_method(given: MethodInput, method: str) -> Tensor:
-    """The method's texture [H,W,3] on the CPU, from the start: what an earlier method left behind is cleared.
-
-    What no photograph shows is guessed from the surface beside it, as in a run.
-    """
+    """The method's texture [H,W,3] on the CPU, from the start: what an earlier method left behind is cleared."""
     given.work.clear()
     given = dataclasses.replace(given, facts={})
     record = known_methods()[method]
@@ -152,6 +149,11 @@ def run_method(given: MethodInput, method: str) -> Tensor:
         given = started(given)
     given = dataclasses.replace(given, config=dataclasses.replace(given.config, method=method))
     texture, _ = texture_function(method)(given)
+    return completed(given, texture)
+
+
+def completed(given: MethodInput, texture: Tensor) -> Tensor:
+    """The texture [H,W,3], on the CPU, with a guess from the surface where no photograph shows it, as a run ends."""
     touched = given.maps[1].slot_map >= 0
     return complete_texture(given.atlas, texture, touched & given.facts.get("known", touched)).texture.cpu()
 

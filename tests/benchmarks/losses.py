@@ -27,6 +27,7 @@ import torch.nn.functional as F
 from harness import (
     RESULTS,
     Results,
+    completed,
     geometric_means,
     markdown_table,
     parsed_size,
@@ -48,7 +49,7 @@ from advtex_engine.methods import MethodInput
 from advtex_engine.methods.mean import dense_texture
 from advtex_engine.methods.vgg import load_vgg
 from advtex_engine.render.pairs import own_pairs
-from advtex_engine.render.texture import fill_holes, sample_texels
+from advtex_engine.render.texture import sample_texels
 from advtex_engine.runtime.devices import choose_device
 
 Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -190,7 +191,7 @@ def run(arguments: argparse.Namespace, results: Results) -> None:
                     steps = 0 if name == "start" else arguments.steps
                     loss = loss_named("l1" if name == "start" else name, device)
                     values, ms = descended(given, loss, steps)
-                texture = fill_holes(dense_texture(maps, values).clamp(0, 1), maps.slot_map >= 0).cpu()
+                texture = completed(given, dense_texture(maps, values).clamp(0, 1))
                 scores = score_model(given, texture, scan, Path(folder) / "model", None, arguments.lpips_weights)
                 results.add({**common, "loss": name}, {**scores, "ms": ms}, time.perf_counter() - began)
 

@@ -26,6 +26,7 @@ from harness import (
     RESULTS,
     Results,
     Stopwatch,
+    completed,
     load_truth,
     markdown_table,
     needed_lpips,
@@ -49,7 +50,6 @@ from advtex_engine.metrics.evaluate import score_views
 from advtex_engine.metrics.lpips import Lpips
 from advtex_engine.render.render_view import render_layers
 from advtex_engine.render.streaming import ResidentViews
-from advtex_engine.render.texture import fill_holes
 from advtex_engine.runtime.devices import choose_device
 from advtex_engine.synthetic.scan import SUPERSAMPLE
 
@@ -131,7 +131,7 @@ def play(given: MethodInput, lpips: Lpips, score: Score, results: Results, setti
             began = time.monotonic()
             probes.reached(step, optimizer.result)
             looks[name] += time.monotonic() - began
-        texture = fill_holes(dense_texture(maps, optimizer.result).clamp(0, 1), maps.slot_map >= 0).cpu()
+        texture = completed(given, dense_texture(maps, optimizer.result).clamp(0, 1))
         found = {f"gain_{name}": probes.turns.gain for name, probes in judges.items()}
         found |= {f"looks_{name}": seconds * step / in_steps for name, seconds in looks.items()}
         results.add({**settings, "step": step}, {"lpips": score(texture), **found}, watch.seconds)

@@ -343,6 +343,8 @@ def report(arguments: argparse.Namespace, results: Results) -> None:
     """learning.md: a line per option; per scan its mean share at the end, and over all scans and seeds the least."""
     body, found = "", list[dict[str, Any]]()
     for elsewhere, title in ((False, "Learned on the scan"), (True, "Learned on all other scans")):
+        if elsewhere and len(arguments.scans) == 1:
+            continue
         lines = list[list[Any]]()
         for name in OPTIONS:
             of_scans = [_cells(arguments, results, scan, name, elsewhere) for scan in arguments.scans]

@@ -48,7 +48,7 @@ def select_views(given: MethodInput) -> Selection:
     # What is hidden by less than this counts as seen.
     tolerance = DEPTH_TOLERANCE[given.scene.kind] * OCCLUSION_SHARE
     candidates = find_candidates(mesh, maps, tolerance)
-    candidates = replace(candidates, cost=candidates.cost + blur_cost(mesh, candidates, maps, given.means[1]))
+    candidates = replace(candidates, cost=candidates.cost + blur_cost(mesh, candidates, maps))
     assignment = assign_views(mesh, candidates)
     texels = map_texels(atlas)
     blend = blend_texels(mesh, texels, assignment.view, candidates.view, Sampler(maps, tolerance))

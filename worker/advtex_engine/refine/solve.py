@@ -17,7 +17,9 @@ from torch import Tensor
 
 from advtex_engine.refine.points import Observations
 
-SOLVER_STEPS = 30
+# After so many the solution is within .3 % of the exact one on every scan tried (.03 % in the median); what calls this
+# begins anew from it anyway.
+SOLVER_STEPS = 12
 ROBUST_ROUNDS = 3
 
 

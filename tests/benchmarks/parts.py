@@ -85,6 +85,7 @@ VARIANTS = {
     "view selection without agreement": Variant(
         "view_selection", code={f"{SELECTION}.candidates.AGREEMENT_WEIGHT": 0.0}
     ),
+    "view selection without shared tones": Variant("view_selection", code={f"{SELECTION}.tones.SCALE": 1e-6}),
     "view selection without back-projection": Variant(
         "view_selection", code={"advtex_engine.methods.view_selection.back_project": lambda color, *_: color}
     ),

@@ -16,6 +16,7 @@ from advtex_engine.selection.candidates import OCCLUSION_SHARE, find_candidates
 from advtex_engine.selection.detail import blur_cost
 from advtex_engine.selection.leveling import Sampler, blend_texels
 from advtex_engine.selection.mrf import assign_views
+from advtex_engine.selection.tones import shared_tones
 
 
 @dataclass(frozen=True)
@@ -52,13 +53,14 @@ def select_views(given: MethodInput) -> Selection:
     assignment = assign_views(mesh, candidates)
     texels = map_texels(atlas)
     blend = blend_texels(mesh, texels, assignment.view, candidates.view, Sampler(maps, tolerance))
+    color = (blend.color + shared_tones(mesh, texels, blend.color, blend.known, candidates)).clamp(0, 1)
     own = torch.where(blend.known, assignment.view[texels.face], -1)
     agreement = torch.where(blend.known, blend.own * assignment.agreement[texels.face], 0.0)
     color, label, confidence = (
         torch.full((atlas.height * atlas.width, *part.shape[1:]), nothing, dtype=part.dtype, device=part.device)
         .index_copy_(0, texels.texel, part)
         .view(atlas.height, atlas.width, *part.shape[1:])
-        for part, nothing in ((blend.color, 0), (own, -1), (agreement, 0))
+        for part, nothing in ((color, 0), (own, -1), (agreement, 0))
     )
     known = label >= 0
     texture = fill_holes(back_project(color, label, maps), known)

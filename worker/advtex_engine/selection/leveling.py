@@ -174,7 +174,7 @@ def blend_texels(mesh: Mesh, texels: TexelMap, label: Tensor, sees: Tensor, samp
     maps, adjacency = sampler.maps, face_adjacency(mesh.t_pos_idx)
     nodes = make_nodes(mesh.t_pos_idx, label, maps.count)
     offset = seam_offsets(mesh.t_pos_idx, label, adjacency, nodes, node_colors(mesh, sampler, nodes))
-    rings = _Rings(mesh.t_pos_idx, len(mesh.v_pos))
+    rings = Rings(mesh.t_pos_idx, len(mesh.v_pos))
     incidence = torch.bincount(nodes.corner[label >= 0].flatten(), minlength=len(nodes.vertex))
     faces = torch.bincount(nodes.vertex, incidence.double(), minlength=len(mesh.v_pos)).clamp(min=1)
     share = (incidence / faces[nodes.vertex]).to(torch.float32)[:, None]
@@ -189,7 +189,7 @@ def blend_texels(mesh: Mesh, texels: TexelMap, label: Tensor, sees: Tensor, samp
             continue
         field = torch.zeros((len(mesh.v_pos), 4), device=points.device)
         field[nodes.vertex[mine]] = weighted[mine]
-        field = rings.fade(field)
+        field = rings.fade(field, BLEND_RINGS)
         shown = (field[mesh.t_pos_idx, 3] > 0).any(1) & ((sees == view).any(1) | (label == view))
         which = shown[texels.face].nonzero()[:, 0]
         face = texels.face[which]
@@ -206,7 +206,7 @@ def blend_texels(mesh: Mesh, texels: TexelMap, label: Tensor, sees: Tensor, samp
     return Blend(torch.where(known[:, None], low / weight + detail, 0.0).clamp(0, 1), known, (own / weight)[:, 0])
 
 
-class _Rings:
+class Rings:
     """Averages of vertex values over their neighbors."""
 
     def __init__(self, t_pos_idx: Tensor, vertices: int) -> None:
@@ -216,9 +216,9 @@ class _Rings:
         degree = torch.bincount(torch.cat((self.first, self.second)), minlength=vertices)
         self.over = 1 / (1 + degree[:, None].to(torch.float32))
 
-    def fade(self, field: Tensor) -> Tensor:
-        """[V,C], BLEND_RINGS times replaced by the mean of each vertex and its neighbors."""
-        for _ in range(BLEND_RINGS):
+    def fade(self, field: Tensor, times: int) -> Tensor:
+        """[V,C], `times` replaced by the mean of each vertex and its neighbors."""
+        for _ in range(times):
             total = field.index_add(0, self.first, field[self.second]).index_add_(0, self.second, field[self.first])
             field = total * self.over
         return field

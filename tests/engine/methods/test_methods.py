@@ -24,6 +24,7 @@ from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Atlas, Camera, Mesh, Scene, View
 from advtex_engine.methods import LossPoint, MethodInput, descent, gabor, texture_function
 from advtex_engine.methods.best_view import label_faces
+from advtex_engine.methods.gabor import BLOCK
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.sharpest import sharpness
 from advtex_engine.methods.vgg import WEIGHTS_VARIABLE, load_vgg
@@ -311,6 +312,53 @@ def test_gabor_compares_other_windows_at_each_step(tmp_path: Path, monkeypatch: 
     gabor.gabor(replace(given, maps={1: maps}, means={1: mean_texture(maps)}))
     assert {tuple(photograph.shape) for photograph in seen} == {(1, 3, *reversed(crop_size(120, 96)))}
     assert len({float(photograph[0, 0, 0, 0]) for photograph in seen}) > 20
+
+
+def test_the_wide_term_is_the_difference_of_means_over_blocks() -> None:
+    """Against loops; its gradient pulls all pixels of a block alike, and background neither counts nor is pulled."""
+    generator = torch.Generator().manual_seed(5)
+    render, photograph = (torch.rand((1, 3, 24, 20), generator=generator) * 2 - 1 for _ in range(2))
+    foreground = (torch.rand((1, 1, 24, 20), generator=generator) < 0.7).float()
+    difference = (render - photograph) * foreground
+    found = [
+        difference[0, :, row : row + BLOCK, column : column + BLOCK].mean((1, 2)).abs().mean()
+        for row in range(0, 24 - BLOCK + 1, BLOCK // 2)
+        for column in range(0, 20 - BLOCK + 1, BLOCK // 2)
+    ]
+    render.requires_grad_(True)
+    value = gabor.wide_loss(render, photograph, foreground)
+    torch.testing.assert_close(value, torch.stack(found).mean())
+    (pull,) = torch.autograd.grad(value, [render])
+    assert bool((pull[(foreground == 0).expand_as(pull)] == 0).all())
+    corner = pull[0, 0, : BLOCK // 2, : BLOCK // 2][foreground[0, 0, : BLOCK // 2, : BLOCK // 2] > 0]
+    torch.testing.assert_close(corner, corner[:1].expand_as(corner))
+
+
+def test_gabor_takes_what_is_wide_from_all_photographs_and_keeps_detail(tmp_path: Path) -> None:
+    """Spots of twelve pixels that the start shows too dark, over fine print: the print is as sharp as before."""
+    generator = torch.Generator().manual_seed(6)
+    fine = F.interpolate(torch.rand((1, 1, SIDE // 3, SIDE // 3), generator=generator), (SIDE, SIDE), mode="bilinear")
+    picture = (0.3 + 0.4 * fine[0, 0])[..., None].expand(-1, -1, 3).contiguous()
+    shifts = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)]
+    maps = planar_maps(
+        torch.stack([(picture.roll(by, (0, 1)) * 255).round().to(torch.uint8) for by in shifts]), SIDE, SIDE
+    )
+    spots = F.interpolate((torch.rand((1, 1, 8, 8), generator=generator) < 0.5).float(), (SIDE, SIDE))[0, 0, ..., None]
+    start = picture - 0.05 * spots
+    given = task(plane(), (view("0", plane(), truth(), camera((0.5, 0.45, 1.0))),), tmp_path)
+    config, work = TextureConfig(method="gabor", steps=300), WorkFolder(tmp_path / "gabor", "", Monitor())
+    given = replace(given, maps={1: maps}, means={1: mean_texture(maps)}, start=start, config=config, work=work)
+    texture, _ = texture_function("gabor")(given)
+    inner = (slice(8, -8), slice(8, -8))
+
+    def wide(image: Tensor) -> Tensor:
+        return F.avg_pool2d((image - picture)[inner].permute(2, 0, 1)[None], BLOCK, 2).abs().mean()
+
+    def slope(image: Tensor) -> Tensor:
+        return image[inner].diff(dim=0).abs().mean() + image[inner].diff(dim=1).abs().mean()
+
+    assert wide(texture) < 0.5 * wide(start)
+    assert 0.95 < float(slope(texture) / slope(picture)) < 1.05
 
 
 def test_gabor_gives_the_same_texture_stopped_or_not(tmp_path: Path) -> None:

@@ -1,13 +1,15 @@
 """View selection's texture, descended to what all photographs agree on but for displacement: no opponent is trained.
 
 Each step compares a view's photograph with the texture's render by Gabor energies (`adversarial/gabor.py`), which
-forgive some pixels, so that every view adds to a texture that begins as a patchwork of single ones. On five scans the
-adversarial game, of whose losses this is one, ends at the same distance (`tests/benchmarks/results/scans_320`).
+forgive some pixels, so that every view adds to a texture that begins as a patchwork of single ones. Energies say
+nothing of colors, and nothing of what is wider than their coarsest octave: there means over blocks are compared, which
+some pixels of displacement hardly change either.
 """
 
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from advtex_engine.adversarial.gabor import gabor_filters, gabor_loss
@@ -19,6 +21,7 @@ from advtex_engine.render.view_maps import ViewMaps
 
 PASSES = 20  # over all views, unless the number of steps is asked for
 LR = 5e-4  # of the first step, in colors of [0, 1]
+BLOCK = 8  # pixels a side, of which means are compared; every half of it
 
 
 def gabor(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
@@ -39,9 +42,18 @@ def gabor(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     def unlikeness(values: Tensor, step: int) -> Tensor:
         photograph, foreground, slots, weights = _seen(maps.only(order[step]), corners[step], (width, height), size)
         render = sample_texels(values, slots, weights).view(1, height, width, 3).permute(0, 3, 1, 2) * 2 - 1
-        return gabor_loss(render, photograph, foreground, filters)
+        return gabor_loss(render, photograph, foreground, filters) + wide_loss(render, photograph, foreground)
 
     return descend(given, "gabor", unlikeness, len(order), generator, rate=LR)
+
+
+def wide_loss(render: Tensor, photograph: Tensor, foreground: Tensor) -> Tensor:
+    """0-dim: mean absolute difference of means over blocks; a gradient for the render.
+
+    render, photograph: [1,3,h,w] in [-1,1], at least a block a side; they count where foreground [1,1,h,w] is not 0.
+    """
+    difference = torch.where(foreground > 0, render - photograph, 0.0)
+    return F.avg_pool2d(difference, BLOCK, BLOCK // 2).abs().mean()
 
 
 def _seen(

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from advtex_engine.core.cameras import project
 from advtex_engine.core.scene import Camera, DepthFrame, Mesh
+from advtex_engine.mesh import registration
 from advtex_engine.mesh.registration import move_mesh, register_camera, register_mesh
 from advtex_engine.render.rasterize import rasterize
 from advtex_engine.synthetic.patches import look_at
@@ -131,6 +132,17 @@ def test_wherever_it_was_put_it_never_fits_worse(
     if not report["accepted"]:
         assert mesh is placed
         assert report["moved_mm"] == 0
+
+
+def test_a_step_never_mirrors_the_mesh() -> None:
+    """Readings that all lie on the far side of a sphere's center ask for a growth below -1."""
+    normals = torch.nn.functional.normalize(
+        torch.randn((500, 3), generator=torch.Generator().manual_seed(1), dtype=torch.float64), dim=1
+    )
+    offsets = torch.full((500,), -1.4, dtype=torch.float64)
+    pairs = registration._Pairs(normals, normals, offsets, torch.ones_like(offsets))
+    step = registration._solve(pairs, 1.0, with_scale=True)
+    assert 0.1 < float(torch.linalg.det(step[:3, :3])) ** (1 / 3) < 0.4
 
 
 def test_without_depth_the_model_stays() -> None:

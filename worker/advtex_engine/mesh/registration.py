@@ -169,7 +169,8 @@ def _solve(pairs: _Pairs, radius: float, with_scale: bool) -> Tensor:
     step = torch.linalg.solve(normal_matrix, jacobian.T @ (weights * offsets)).cpu()
     turn = torch.zeros((3, 3), dtype=torch.float64)
     turn[2, 1], turn[0, 2], turn[1, 0] = step[:3]
-    growth = 1 + float(step[6]) if with_scale else 1.0
+    # As the turn is: a long step must not mirror the mesh.
+    growth = math.exp(float(step[6])) if with_scale else 1.0
     motion = torch.eye(4, dtype=torch.float64)
     motion[:3, :3] = growth * torch.linalg.matrix_exp(turn - turn.T)
     middle = middle.cpu()

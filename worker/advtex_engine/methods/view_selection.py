@@ -1,4 +1,4 @@
-"""View selection: every face shows one photograph (after Waechter et al. 2014, "Let There Be Color!")."""
+"""View selection: every face shows one photograph's detail (after Waechter et al. 2014, "Let There Be Color!")."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""One photograph per face: candidates, labels, leveled seams, detail projected back."""
+"""One photograph per face: candidates, labels, leveled seams, tones of many, detail projected back."""

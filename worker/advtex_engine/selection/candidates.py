@@ -258,6 +258,15 @@ def _gradient(gray: Tensor) -> Tensor:
     return ((gray.diff(dim=2) ** 2).mean() + (gray.diff(dim=3) ** 2).mean()).sqrt()
 
 
+def mean_colors(color: Tensor) -> Tensor:
+    """[T,K,7,3] uint8 -> [T,K,3] float32 in [0,1], the means over a face's places."""
+    # Place by place: all of them in float32 would be the largest thing in a run's memory.
+    total = color[:, :, 0].to(torch.float32)
+    for place in range(1, POINTS):
+        total += color[:, :, place]
+    return total / POINTS / 255
+
+
 def disagreement(color: Tensor, valid: Tensor) -> Tensor:
     """[T,K] how far each view's mean color lies from what most views of the face show, 0 to MAX_DISAGREEMENT.
 
@@ -265,7 +274,7 @@ def disagreement(color: Tensor, valid: Tensor) -> Tensor:
     that lack detail, such as thin lines that the others show in different places. The consensus is a mean with weights
     exp(-d^2 / 2 s^2) found by repetition, s the root mean square deviation so far but at least AGREEMENT_SCALE.
     """
-    values = color.to(torch.float32).mean(2) / 255
+    values = mean_colors(color)
     weight = valid.to(torch.float32)
     for _ in range(AGREEMENT_ROUNDS):
         total = weight.sum(1, keepdim=True).clamp(min=1e-6)

@@ -15,10 +15,11 @@ from torch import Tensor
 
 from advtex_engine.core.scene import Mesh
 from advtex_engine.render.texels import TexelMap
-from advtex_engine.selection.candidates import Candidates
+from advtex_engine.selection.candidates import Candidates, mean_colors
 from advtex_engine.selection.leveling import Rings
 
 REACH = 6.0  # texels, about the standard deviation of the means over the surface: what is finer is detail
+MOST_RINGS = 64  # where faces are smaller than texels the reach shrinks, and the time does not grow
 SCALE = 0.05  # difference in color, of 1, beyond which a photograph hardly counts
 
 
@@ -32,7 +33,7 @@ def shared_tones(mesh: Mesh, texels: TexelMap, color: Tensor, known: Tensor, can
     sums = color.new_zeros((faces, 4))
     sums.index_add_(0, texels.face[known], torch.cat((color[known], torch.ones_like(color[known, :1])), 1))
     count = sums[:, 3:]
-    difference = candidates.color.to(color.dtype).mean(2) / 255 - (sums[:, :3] / count.clamp(min=1))[:, None]
+    difference = mean_colors(candidates.color) - (sums[:, :3] / count.clamp(min=1))[:, None]
     worse = candidates.cost - candidates.cost.amin(1, keepdim=True)
     weight = torch.exp(-worse - difference.square().mean(2) / (2 * SCALE**2)) * (candidates.view >= 0) * (count > 0)
     total = weight.sum(1, keepdim=True)
@@ -45,7 +46,7 @@ def shared_tones(mesh: Mesh, texels: TexelMap, color: Tensor, known: Tensor, can
 def _rings(texels: TexelMap, faces: int) -> int:
     """How often means over neighboring vertices are taken for REACH, by how long the sides of the mean face are."""
     side = math.sqrt(2 * max(1, len(texels.texel)) / faces)
-    return math.ceil((REACH / side) ** 2)
+    return min(MOST_RINGS, math.ceil((REACH / side) ** 2))
 
 
 def _spread(mesh: Mesh, values: Tensor, rings: int) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Iterator
 from functools import partial
@@ -21,6 +22,7 @@ import parts
 import probes
 import pytest
 import real_errors
+import recipes
 import scans
 import sparsity
 import study
@@ -427,6 +429,45 @@ def test_losses_are_compared_one_by_one(desk: Path, tmp_path: Path, weights: Pat
     assert len({cell["scores"]["lpips"] for cell in cells}) == len(names), "each is a loss of its own"
     assert vars(losses.gabor) == before
     assert "## desk, 96x64, 4 steps, cameras as they are" in (tmp_path / "out" / "losses.md").read_text()
+
+
+def test_recipes_are_played_one_by_one(
+    desk: Path, tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recipes, "TextureConfig", partial(TextureConfig, refine=False))
+    monkeypatch.setattr(recipes, "SCAN_FACES", 600)
+    names = ["view selection", "gabor", "as it is", "wide means compared", "awake", "awake, two scales"]
+    names += ["awake, four crops a step", "awake, the source itself, displaced"]
+    line = [str(desk), "--size", "96x64", "--steps", "6", "--device", "cpu", "--recipes", *names]
+    for _ in range(2):  # the second time nothing is missing
+        recipes.main([*line, "--lpips-weights", str(weights), "--results", str(tmp_path / "out")])
+    cells = json.loads((tmp_path / "out" / "recipes.json").read_text())["cells"]
+    assert [cell["settings"]["recipe"] for cell in cells] == names
+    assert len({cell["scores"]["psnr"] for cell in cells}) == len(cells), "each is a recipe of its own"
+    told = {cell["settings"]["recipe"]: "told apart, end" in cell["scores"] for cell in cells}
+    assert told == {name: recipes.RECIPES[name].method == "adversarial" for name in names}
+    page = (tmp_path / "out" / "recipes.md").read_text()
+    assert all(f"| {name} |" in page for name in names)
+
+
+def test_blurred_photographs_are_left_out_of_the_sharper_half(desk: Path, tmp_path: Path) -> None:
+    config = TextureConfig(preset="standard", size=(96, 64), refine=False, face_budget=600, device="cpu")
+    given = harness.prepare(desk, config, tmp_path, torch.device("cpu"))
+    widely = dataclasses.replace(given.preset, max_pair_angle=60.0, min_pair_overlap=0.1)
+    given, maps = dataclasses.replace(given, preset=widely), given.maps[1]
+    blurred = list(range(0, maps.count, 3))
+    for view in blurred:
+        color = maps.color[view].view(maps.height, maps.width, 3)
+        color.copy_(torch.from_numpy(cv2.GaussianBlur(color.numpy(), (0, 0), 3)))
+    before, after = recipes.pairs_of(given, maps), recipes.sharper_pairs(given, maps)
+    shown = [set(after.auxiliary[view, 1 : after.count[view]].tolist()) for view in range(maps.count)]
+    offered = [set(before.auxiliary[view, 1 : before.count[view]].tolist()) for view in range(maps.count)]
+    assert max(map(len, offered)) > 3
+    for view, (kept, all_of_them) in enumerate(zip(shown, offered, strict=True)):
+        assert after.auxiliary[view, 0] == view, "the source itself stays"
+        assert kept <= all_of_them
+        assert len(kept) == (len(all_of_them) + 1) // 2
+        assert not kept & set(blurred) or all_of_them - set(blurred) <= kept, "a sharp one goes before a blurred one"
 
 
 @pytest.mark.slow

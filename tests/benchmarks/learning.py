@@ -24,6 +24,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import torch
 import torch.nn.functional as F
@@ -48,6 +49,7 @@ PENALTY = 10.0
 CROPS = 4
 DRAWS = 200
 """Pairs of a scan that nothing is learned of."""
+CENTERED = "accuracy, centered"
 
 
 class He(PatchDiscriminator):
@@ -272,7 +274,11 @@ def learn(given: MethodInput, option: Option, steps: int, seed: int) -> dict[str
 def learn_elsewhere(
     unseen: MethodInput, others: Sequence[MethodInput], option: Option, steps: int, seed: int
 ) -> dict[str, float]:
-    """What is told apart of a scan after so many steps on each of the others, by turns; nothing is learned of it."""
+    """What is told apart of a scan after so many steps on each of the others, by turns; nothing is learned of it.
+
+    Logits of another scan lie higher or lower as a whole. Centered: less their mean over this scan's examples, real and
+    fake, which takes no knowledge of which is which; over other draws than those that are told apart then.
+    """
     torch.manual_seed(seed)
     last, *players = (optimizer_of(given, option, steps, seed) for given in (unseen, *others))
     first = players[0]
@@ -288,9 +294,24 @@ def learn_elsewhere(
     last.discriminator, last.parameters = first.discriminator, first.parameters
     last.bfloat16 = last.bfloat16
     last.schedule.read()
-    told = torch.stack([last.play(last.draw()).told for _ in range(DRAWS)]).sum(0)
-    read = knowledge(told.tolist())
-    return {f"{name} {SHARES[-1]:g}": read[name] for name in ("accuracy", "margin")}
+
+    def told() -> list[float]:
+        return torch.stack([last.play(last.draw()).told for _ in range(DRAWS)]).sum(0).tolist()
+
+    asked = told()
+    patches, real_sum, fake_sum = asked[0], asked[3], asked[4]
+    middle = (real_sum + fake_sum) / (2 * patches)
+    examine = first.discriminator.examine
+
+    def centered(x: Tensor, parameters: Sequence[Tensor] | None = None) -> tuple[Tensor, list[Tensor]]:
+        logits, features = examine(x, parameters)
+        return logits - middle, features
+
+    with patch.object(first.discriminator, "examine", centered):
+        again = told()
+    read = knowledge(asked)
+    found = {f"{name} {SHARES[-1]:g}": read[name] for name in ("accuracy", "margin", "spread")}
+    return found | {CENTERED: knowledge(again)["accuracy"]}
 
 
 def fill(arguments: argparse.Namespace, results: Results) -> None:
@@ -350,10 +371,11 @@ def report(arguments: argparse.Namespace, results: Results) -> None:
             of_scans = [_cells(arguments, results, scan, name, elsewhere) for scan in arguments.scans]
             if every := [cell for cells in of_scans for cell in cells]:
                 found += every
-                means = [_mean(cells, SHARES[-1]) for cells in of_scans]
-                early = [] if elsewhere else [_mean(every, share) for share in SHARES[:-1]]
-                least = min(cell["scores"][f"accuracy {SHARES[-1]:g}"] for cell in every)
-                lines.append([name, *means, *early, least, len(every)])
+                last, *before = (f"accuracy {share:g}" for share in reversed(SHARES))
+                early = [] if elsewhere else [_mean(every, share) for share in reversed(before)]
+                for label, score in ((name, last), (f"{name}, centered", CENTERED))[: 2 if elsewhere else 1]:
+                    least = min(cell["scores"][score] for cell in every)
+                    lines.append([label, *(_mean(cells, score) for cells in of_scans), *early, least, len(every)])
         if lines:
             head = ["option", *(scan.stem for scan in arguments.scans)]
             if not elsewhere:
@@ -377,8 +399,8 @@ def _cells(
     return [cell for cell in found if cell is not None]
 
 
-def _mean(cells: Sequence[dict[str, Any]], share: float) -> float | None:
-    return statistics.mean(cell["scores"][f"accuracy {share:g}"] for cell in cells) if cells else None
+def _mean(cells: Sequence[dict[str, Any]], name: str) -> float | None:
+    return statistics.mean(cell["scores"][name] for cell in cells) if cells else None
 
 
 def main(line: list[str] | None = None) -> None:

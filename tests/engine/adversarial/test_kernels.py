@@ -396,17 +396,15 @@ def test_a_step_is_few_kernels(fused: ModuleType, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.slow
 @pytest.mark.skipif(DEVICE.type == "cuda", reason="a GPU adds up in any order, which leads a game elsewhere")
-def test_two_hundred_steps_on_the_kernels_end_like_those_on_torch(
-    fused: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_on_the_kernels_ends_like_one_on_torch(fused: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fused, "BLOCK", 1024)  # a crop: the interpreter computes what a program masks, too
     preset = dataclasses.replace(
-        PRINTED, pretraining=20, averaging=50, lr_end=0.1, lr_discriminator=3e-4, max_crop=(32, 32)
+        PRINTED, pretraining=10, averaging=25, lr_end=0.1, lr_discriminator=3e-4, max_crop=(32, 32)
     )
     with one_thread_each():  # how sums are cut into threads shows in their last digit, and then in the sign of an L1
-        ours, plain = optimizer(fused, preset, 200), optimizer(None, preset, 200)
+        ours, plain = optimizer(fused, preset, 110), optimizer(None, preset, 110)
         start = plain.values.detach().clone()
-        for _ in range(200):
+        for _ in range(110):
             ours.step()
             plain.step()
     assert float((plain.values - start).detach().abs().mean()) > 0.01, "the texture has gone somewhere"

@@ -8,7 +8,7 @@ axis is the z axis and its foot lies at z = 0.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import torch
@@ -24,8 +24,12 @@ SPACING = 4.5
 """Millimetres between vertices: fine enough for the paper's per-vertex offsets to bend every surface."""
 
 
+@cache
 def build(seed: int = 0) -> tuple[Atlas, torch.Tensor]:
-    """The object with its atlas, and its texture [TEXTURE_SIZE,TEXTURE_SIZE,3] uint8 sRGB; light is baked in."""
+    """The object with its atlas, and its texture [TEXTURE_SIZE,TEXTURE_SIZE,3] uint8 sRGB; light is baked in.
+
+    Made once for all scans of a process, and shared: not to be written to.
+    """
     parts = patches(seed)
     corners = pack([patch.drawing.shape[:2] for patch in parts], TEXTURE_SIZE)
     mesh = join(parts, corners, TEXTURE_SIZE)

@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from advtex_engine.core.rows import distinct_rows
 from advtex_engine.core.scene import Atlas, Camera, Mesh, Scene, View
 from advtex_engine.render.rasterize import rasterize_views
 from advtex_engine.render.texture import sample_image
@@ -52,7 +53,7 @@ def _ball(cuts: int) -> Mesh:
         place = torch.tensor([side % 3, side // 3])
         inner = torch.stack((column, row), 1) / cuts * (1 - 2 * MARGIN) + MARGIN
         uv.append((inner + place) / 3)
-    points, vertex = torch.unique(torch.cat(lattice), dim=0, return_inverse=True)
+    points, vertex = distinct_rows(torch.cat(lattice))
     direction = F.normalize(points.double() / cuts - 0.5, dim=1)
     bumps = 1 + BUMPS * (torch.sin(9 * direction) * torch.sin(7 * direction.roll(1, 1))).sum(1, keepdim=True)
     first = (row * (cuts + 1) + column)[(row < cuts) & (column < cuts)]

@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from advtex_engine.core.rows import distinct_rows
 from advtex_engine.core.scene import Mesh
 
 FOLD = 60.0
@@ -60,7 +61,7 @@ def cut_at_folds(mesh: Mesh) -> SmoothSurface:
     fans, corners = torch.unique(label, return_inverse=True)
     corners = corners.view(-1, 3)
     ends = torch.stack((corners, corners.roll(-1, 1)), 2).view(-1, 2).sort(1).values
-    edges = torch.unique(ends, dim=0)
+    edges, _ = distinct_rows(ends)
     return SmoothSurface(mesh.v_pos[faces.flatten()[fans]], corners, edges, normals)
 
 

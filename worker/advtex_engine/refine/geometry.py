@@ -24,6 +24,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advtex_engine.core.cameras import stack_cameras
+from advtex_engine.core.rows import distinct_rows
 from advtex_engine.core.scene import Mesh, Scene
 from advtex_engine.mesh.normals import vertex_normals
 from advtex_engine.refine.check import MARGIN, better, disagreement
@@ -114,7 +115,7 @@ class _Surface:
         self._K, self._poses = stack_cameras(cameras, mesh.v_pos.device)
         self._depth = float(depths[depths > 0].median()) if bool((depths > 0).any()) else 1.0
         sides = torch.cat([mesh.t_pos_idx[:, [a, b]] for a, b in ((0, 1), (1, 2), (2, 0))]).sort(1).values
-        self._edges = torch.unique(sides, dim=0)
+        self._edges, _ = distinct_rows(sides)
         self._cell = grid_cells(mesh.v_pos[mesh.t_pos_idx].double().mean(1), self._depth)
         share = torch.rand(int(self._cell.max()) + 1, generator=generator)
         self._aside = (share < CHECKED_SHARE).to(self._cell.device)[self._cell]

@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advtex_engine.core.cameras import project, scaled_camera
+from advtex_engine.core.rows import distinct_rows
 from advtex_engine.core.scene import Camera, Mesh, View
 from advtex_engine.render.rasterize import rasterize_views
 from advtex_engine.render.view_maps import DEPTH_TOLERANCE
@@ -152,8 +153,7 @@ def surface_cells(candidates: Candidates, depths: Tensor) -> Tensor:
 
 def grid_cells(position: Tensor, depth: Tensor | float) -> Tensor:
     """[N] int64: the cell of a grid in space, CELL_SIZE of this depth wide, that each position [N,3] lies in."""
-    cell: Tensor = torch.unique((position / (CELL_SIZE * depth)).floor().long(), dim=0, return_inverse=True)[1]
-    return cell
+    return distinct_rows((position / (CELL_SIZE * depth)).floor().long())[1]
 
 
 def _looks(position: Tensor, normal: Tensor, cameras: list[Camera], depths: Tensor) -> Iterator[tuple[Tensor, Tensor]]:

@@ -19,6 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from advtex_engine.core.rows import distinct_rows
 from advtex_engine.core.scene import Mesh, View
 from advtex_engine.refine.check import MARGIN, better, disagreement, improved, rounded
 from advtex_engine.refine.points import Observations
@@ -188,7 +189,7 @@ def _points(working: WorkingViews, seed: int) -> tuple[Observations, Tensor, Ten
         .local[..., 2][points.seen]
         .median()
     )
-    cell = torch.unique((position / (CELL_SIZE * depth)).floor().long(), dim=0, return_inverse=True)[1]
+    cell = distinct_rows((position / (CELL_SIZE * depth)).floor().long())[1]
     drawn = torch.rand(int(cell.max()) + 1, generator=torch.Generator().manual_seed(seed)) < CHECKED_SHARE
     return points, points.seen & drawn.to(cell.device)[cell][point], cell
 

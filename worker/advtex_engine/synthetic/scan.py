@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from advtex_engine.core.cameras import camera_to_world
 from advtex_engine.core.errors import OptionError
+from advtex_engine.core.rows import distinct_rows
 from advtex_engine.core.scene import Atlas, Camera, Mesh
 from advtex_engine.mesh.normals import vertex_normals
 from advtex_engine.mesh.read import NUMPY, to_mesh
@@ -277,7 +278,7 @@ def _bent(mesh: Mesh, error: float, rng: np.random.Generator) -> Mesh:
     faces = mesh.t_pos_idx
     count = len(mesh.v_pos)
     edges = torch.cat((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
-    edges = torch.unique(torch.cat((edges, edges.flip(1))), dim=0)
+    edges, _ = distinct_rows(torch.cat((edges, edges.flip(1))))
     degree = torch.zeros(count).index_add_(0, edges[:, 0], torch.ones(len(edges)))
     offset = torch.from_numpy(rng.uniform(-error, error, count).astype(np.float32))
     for _ in range(LAPLACIAN_STEPS):

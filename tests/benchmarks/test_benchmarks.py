@@ -142,7 +142,10 @@ def test_every_way_to_learn_is_tried(
 
 
 @pytest.mark.usefixtures("unrefined")
-def test_what_is_learned_elsewhere_is_asked_of_a_scan_that_was_not_seen(desk: Path, tmp_path: Path) -> None:
+def test_what_is_learned_elsewhere_is_asked_of_a_scan_that_was_not_seen(
+    desk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(learning, "DRAWS", 60)
     scans = [desk, tmp_path / "shelf", tmp_path / "room"]
     for error, scan in zip((0.005, 0.01), scans[1:], strict=True):
         synthesize(scan, views=18, width=96, height=64, camera_error=error)  # one object is built once

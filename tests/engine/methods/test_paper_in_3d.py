@@ -12,7 +12,7 @@ from advtex_engine.core.config import PAPER, PRESETS, TextureConfig
 from advtex_engine.pipeline import texture_scan
 from advtex_engine.synthetic.scan import compare_to_truth, synthesize
 
-STEPS = 2_000
+STEPS = 1_200
 
 
 @pytest.mark.slow

@@ -35,7 +35,7 @@ WORKSPACES = 64 << 20
 HELD_WITH_FEATURES, HELD = 78, 5
 SPREAD, SPREAD_PIXEL = 16, 6  # or it is where the texture's gradient is made: per texel, per pixel of the crop
 CONVOLUTIONS = 360  # per pixel of the crop: what oneDNN keeps by itself, on a CPU
-LIBRARIES = 174 << 20  # on a CPU: code, tables and threads of what steps are the first to use; 158 to 197 were seen
+LIBRARIES = 192 << 20  # on a CPU: code, tables and threads of what steps and glimpses are the first to use
 FILLING = 79  # per texel of a dense texture that is made from a compact one
 SPLATTING = 240  # per pixel of a view that is averaged into the mean texture
 

@@ -22,12 +22,13 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -m venv .venv
 	@$(PIP) --upgrade pip  # the one that came with Python may not know dependency groups
 	@$(PIP) --editable '.[all]' --group dev
+	@$(BIN)/python -m compileall -q client server worker  # else each process would, under PYTHONDONTWRITEBYTECODE
 	@touch $@
 
 test: install
 	$(RUFF) check
 	$(RUFF) format --check
-	$(BIN)/mypy
+	$(BIN)/mypy --num-workers 2
 	$(BIN)/lint-imports
 	# Three processes for two cores, since tests of services wait a lot; one thread each, since threads of two processes
 	# wait for each other.

@@ -271,6 +271,28 @@ def learn(given: MethodInput, option: Option, steps: int, seed: int) -> dict[str
     return found
 
 
+def learned_on(givens: Sequence[MethodInput], option: Option, steps: int, seed: int) -> AdversarialOptimizer:
+    """After so many steps on each of the scans, by turns: the optimizer of the first, with the one discriminator."""
+    torch.manual_seed(seed)
+    players = [optimizer_of(given, option, steps, seed) for given in givens]
+    first = players[0]
+    for parameter, gradient in zip(first.parameters, first._gradients, strict=True):
+        parameter.grad = gradient
+    for player in players:  # one discriminator, one state of its Adam
+        _share(first, player)
+        player._gradients, player.adam_discriminator = first._gradients, first.adam_discriminator
+    for _ in range(steps):
+        for player in players:
+            player.step()
+    return first
+
+
+def _share(first: AdversarialOptimizer, other: AdversarialOptimizer) -> None:
+    """The other plays with the discriminator of the first."""
+    other.discriminator, other.parameters = first.discriminator, first.parameters
+    other.bfloat16 = other.bfloat16
+
+
 def learn_elsewhere(
     unseen: MethodInput, others: Sequence[MethodInput], option: Option, steps: int, seed: int
 ) -> dict[str, float]:
@@ -279,20 +301,9 @@ def learn_elsewhere(
     Logits of another scan lie higher or lower as a whole. Centered: less their mean over this scan's examples, real and
     fake, which takes no knowledge of which is which; over other draws than those that are told apart then.
     """
-    torch.manual_seed(seed)
-    last, *players = (optimizer_of(given, option, steps, seed) for given in (unseen, *others))
-    first = players[0]
-    for parameter, gradient in zip(first.parameters, first._gradients, strict=True):
-        parameter.grad = gradient
-    for player in players:  # one discriminator, one state of its Adam
-        player.discriminator, player.parameters = first.discriminator, first.parameters
-        player._gradients, player.adam_discriminator = first._gradients, first.adam_discriminator
-        player.bfloat16 = player.bfloat16
-    for _ in range(steps):
-        for player in players:
-            player.step()
-    last.discriminator, last.parameters = first.discriminator, first.parameters
-    last.bfloat16 = last.bfloat16
+    first = learned_on(others, option, steps, seed)
+    last = optimizer_of(unseen, option, steps, seed)
+    _share(first, last)
     last.schedule.read()
 
     def told() -> list[float]:

@@ -1,10 +1,12 @@
 """The game's recipes, each played to its end: what a choice does to what the discriminator knows, and to the texture.
 
     python tests/benchmarks/recipes.py SCAN … [--size 320x240] [--preset standard] [--recipes NAME …]
+        [--elsewhere SCAN …]
 
 On scans of one's own, against every 8th frame, held out. Each recipe is the preset with some of its choices made
 otherwise, from the same view selection; "awake" is a discriminator that has learned before the texture moves: He's
 start, a residual ten times as large, a quarter of the rate, and a third of the steps by itself (`learning.py` has why).
+"Learned elsewhere" is one that has learned on the scans of --elsewhere, but never on the one that it plays for then.
 Told apart are shares of patches after the pretraining, in the middle and at the end.
 
 Writes recipes.json (a cell per scan and recipe) and recipes.md below --results, and per scan and recipe the model and a
@@ -14,6 +16,7 @@ contact sheet; goes on with missing cells when started again.
 from __future__ import annotations
 
 import argparse
+import copy
 import dataclasses
 import tempfile
 from pathlib import Path
@@ -35,12 +38,13 @@ from harness import (
     started,
     write_report,
 )
-from learning import Both, SeveralCrops, TwoScales
+from learning import OPTIONS, SLOW, Both, SeveralCrops, TwoScales, learned_on
 from paper import HOLDOUT, SCAN_FACES
 from parts import patched
 from torch import Tensor
 
 from advtex_engine.adversarial.backend import choose_operations
+from advtex_engine.adversarial.discriminator import PatchDiscriminator
 from advtex_engine.core.config import PRESETS, TextureConfig, resolve_preset
 from advtex_engine.methods import MethodInput, texture_function
 from advtex_engine.methods.adversarial import pairs_of
@@ -53,10 +57,14 @@ from advtex_engine.selection.candidates import frame_blur
 
 @dataclasses.dataclass(frozen=True)
 class Recipe:
-    """A method, and what differs from the preset and from the engine's code; alone: share of the steps pretrained."""
+    """A method, and what differs from the preset and from the engine's code.
+
+    alone: share of the steps pretrained. elsewhere: the discriminator has learned on other scans before.
+    """
 
     method: str = "adversarial"
     alone: float | None = None
+    elsewhere: bool = False
     preset: dict[str, Any] = dataclasses.field(default_factory=dict)
     code: dict[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -89,6 +97,8 @@ def widely_compared(device: torch.device) -> Any:
 
 GAME = "advtex_engine.methods.adversarial"
 BOTH = {f"{GAME}.PatchDiscriminator": Both}
+ELSEWHERE = "learned elsewhere"
+ELSEWHERE_SIZE, ELSEWHERE_STEPS = "192x144", 2_000  # on each of the scans
 
 
 def awake(code: dict[str, Any] | None = None, **preset: Any) -> Recipe:
@@ -118,6 +128,7 @@ RECIPES = {
     "awake, the nearest half of the pairs": awake(nearest_share=0.5),
     "awake, the sharper half of the pairs": awake({f"{GAME}.pairs_of": sharper_pairs}),
     "awake, the source itself, displaced": awake(auxiliary=False, perturbation=1 / 320),
+    ELSEWHERE: Recipe(elsewhere=True, preset={"lr_discriminator": 2e-4}),
 }
 
 
@@ -127,11 +138,17 @@ def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--size", default="320x240", help="WIDTHxHEIGHT of the views")
     parser.add_argument("--preset", default="standard", choices=PRESETS)
     parser.add_argument("--steps", type=int, help="the preset's if not given")
-    parser.add_argument("--recipes", nargs="+", default=list(RECIPES), choices=RECIPES, metavar="NAME")
+    parser.add_argument("--recipes", nargs="+", choices=RECIPES, metavar="NAME", help="default: all that can be played")
+    parser.add_argument("--elsewhere", nargs="+", default=[], type=Path, help=f'scans that "{ELSEWHERE}" learns on')
+    parser.add_argument("--elsewhere-steps", type=int, default=ELSEWHERE_STEPS, help="on each of them")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--lpips-weights", type=Path, help="folder; default: $ADVTEX_LPIPS_WEIGHTS, else the cache")
     parser.add_argument("--results", type=Path, default=RESULTS / "recipes", help="folder of the results")
     parsed: argparse.Namespace = parser.parse_args(line)
+    if parsed.recipes is None:
+        parsed.recipes = [name for name, recipe in RECIPES.items() if parsed.elsewhere or not recipe.elsewhere]
+    elif not parsed.elsewhere and any(RECIPES[name].elsewhere for name in parsed.recipes):
+        parser.error(f'"{ELSEWHERE}" needs --elsewhere')
     return parsed
 
 
@@ -156,6 +173,35 @@ def play(given: MethodInput, recipe: Recipe) -> tuple[Tensor, dict[str, float]]:
     return completed(given, texture), told
 
 
+def configured(arguments: argparse.Namespace, size: str) -> TextureConfig:
+    return TextureConfig(
+        preset=arguments.preset,
+        size=parsed_size(size),
+        holdout=HOLDOUT,
+        steps=arguments.steps,
+        face_budget=SCAN_FACES,
+        device=arguments.device,
+    )
+
+
+def begun(scan: Path, config: TextureConfig, device: torch.device) -> MethodInput:
+    """The scan before its optimization; its work folder is gone."""
+    with tempfile.TemporaryDirectory(prefix="advtex-recipes-") as folder:
+        given = prepare(scan, config, Path(folder), device)
+        return started(dataclasses.replace(given, preset=resolve_preset(config, device.type)))
+
+
+def learned_elsewhere(arguments: argparse.Namespace, scan: Path, device: torch.device) -> PatchDiscriminator:
+    """That of `learning.py`'s option "both", after its steps on each of the other scans."""
+    others, config = list[MethodInput](), configured(arguments, ELSEWHERE_SIZE)
+    alone = {"pretraining": arguments.elsewhere_steps, "feature_weight": 0.0, "gabor_weight": 0.0}
+    for other in arguments.elsewhere:
+        if other.stem != scan.stem:
+            given = begun(other, config, device)
+            others.append(dataclasses.replace(given, preset=dataclasses.replace(given.preset, **SLOW, **alone)))
+    return learned_on(others, OPTIONS["both"], arguments.elsewhere_steps, 0).discriminator
+
+
 def fill(arguments: argparse.Namespace, results: Results) -> None:
     """Runs every cell that is not in the results yet; all recipes of a scan begin with one view selection."""
     device = choose_device(arguments.device)
@@ -163,20 +209,18 @@ def fill(arguments: argparse.Namespace, results: Results) -> None:
         missing = [name for name in arguments.recipes if results.find(settings_of(arguments, scan, name)) is None]
         if not missing:
             continue
-        config = TextureConfig(
-            preset=arguments.preset,
-            size=parsed_size(arguments.size),
-            holdout=HOLDOUT,
-            steps=arguments.steps,
-            face_budget=SCAN_FACES,
-            device=arguments.device,
-        )
+        config = configured(arguments, arguments.size)
         with tempfile.TemporaryDirectory(prefix="advtex-recipes-") as folder:
             given = prepare(scan, config, Path(folder), device)
             given = started(dataclasses.replace(given, preset=resolve_preset(config, device.type)))
             for name in missing:
+                recipe = RECIPES[name]
+                if recipe.elsewhere:
+                    learned = learned_elsewhere(arguments, scan, device)
+                    knowing = {f"{GAME}.PatchDiscriminator": lambda _, learned=learned: copy.deepcopy(learned)}
+                    recipe = dataclasses.replace(recipe, code=knowing)
                 watch = Stopwatch()
-                texture, told = play(given, RECIPES[name])
+                texture, told = play(given, recipe)
                 seconds = watch.seconds
                 kept = arguments.results / scan.stem / name.replace(" ", "_").replace(",", "")
                 scores = score_model(given, texture, scan, kept, None, arguments.lpips_weights)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ import torch
 
 import examples
 from advtex_engine.adversarial.discriminator import PatchDiscriminator
+from advtex_engine.adversarial.optimizer import AdversarialOptimizer
 from advtex_engine.core.config import TextureConfig
 from advtex_engine.metrics.lpips import NETWORKS
 from advtex_engine.synthetic import patches
@@ -457,6 +459,41 @@ def test_recipes_are_played_one_by_one(
     assert told == {name: recipes.RECIPES[name].method == "adversarial" for name in names}
     page = (tmp_path / "out" / "recipes.md").read_text()
     assert all(f"| {name} |" in page for name in names)
+
+
+def test_a_recipe_begins_with_what_was_learned_on_other_scans(
+    desk: Path, tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recipes, "TextureConfig", partial(TextureConfig, refine=False))
+    monkeypatch.setattr(recipes, "SCAN_FACES", 600)
+    monkeypatch.setattr(recipes, "ELSEWHERE_SIZE", "96x64")
+    learned = list[tuple[int, Any]]()
+    learn = recipes.learned_on
+
+    def noted(givens: Sequence[Any], *rest: Any) -> Any:
+        optimizer = learn(givens, *rest)
+        learned.append((len(givens), optimizer.discriminator))
+        return optimizer
+
+    monkeypatch.setattr(recipes, "learned_on", noted)
+    begun = list[Any]()
+
+    def with_it(*given: Any, discriminator: Any, **other: Any) -> Any:
+        begun.append(copy.deepcopy(discriminator))
+        return AdversarialOptimizer(*given, discriminator=discriminator, **other)
+
+    monkeypatch.setattr(f"{recipes.GAME}.AdversarialOptimizer", with_it)
+    (tmp_path / "room").symlink_to(desk)
+    line = [str(desk), "--size", "96x64", "--steps", "6", "--device", "cpu", "--recipes", recipes.ELSEWHERE]
+    line += ["--lpips-weights", str(weights), "--results", str(tmp_path / "out")]
+    with pytest.raises(SystemExit):
+        recipes.main(line)
+    recipes.main([*line, "--elsewhere", str(tmp_path / "room"), str(desk), "--elsewhere-steps", "3"])
+    [(scans, discriminator)], [first] = learned, begun
+    assert scans == 1, "the scan itself is left out"
+    for values, of_start in zip(discriminator.parameters(), first.parameters(), strict=True):
+        assert torch.equal(values, of_start)
+    assert f"| {recipes.ELSEWHERE} |" in (tmp_path / "out" / "recipes.md").read_text()
 
 
 def test_blurred_photographs_are_left_out_of_the_sharper_half(desk: Path, tmp_path: Path) -> None:

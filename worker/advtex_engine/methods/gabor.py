@@ -19,8 +19,11 @@ from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.render.texture import bilinear_footprint, decode_uv, sample_texels
 from advtex_engine.render.view_maps import ViewMaps
 
-PASSES = 20  # over all views, unless the number of steps is asked for
-LR = 5e-4  # of the first step, in colors of [0, 1]
+PASSES = 10  # over all views, unless the number of steps is asked for
+REACH = 1e-2
+"""Rate of the first step times the passes, in colors of [0, 1]: how far texels may go. Further on they fit photographs
+that are blurred, whatever the rate is, and edges soften; more steps take smaller ones."""
+MAX_LR = 2e-3  # larger steps leave grain
 BLOCK = 8  # pixels a side, of which means are compared; every half of it
 
 
@@ -44,7 +47,8 @@ def gabor(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
         render = sample_texels(values, slots, weights).view(1, height, width, 3).permute(0, 3, 1, 2) * 2 - 1
         return gabor_loss(render, photograph, foreground, filters) + wide_loss(render, photograph, foreground)
 
-    return descend(given, "gabor", unlikeness, len(order), generator, rate=LR)
+    rate = min(MAX_LR, REACH * len(set(order)) / len(order))
+    return descend(given, "gabor", unlikeness, len(order), generator, rate=rate)
 
 
 def wide_loss(render: Tensor, photograph: Tensor, foreground: Tensor) -> Tensor:

@@ -410,8 +410,8 @@ def _cells(
     return [cell for cell in found if cell is not None]
 
 
-def _mean(cells: Sequence[dict[str, Any]], name: str) -> float | None:
-    return statistics.mean(cell["scores"][name] for cell in cells) if cells else None
+def _mean(cells: Sequence[dict[str, Any]], name: str) -> float | str:
+    return statistics.mean(cell["scores"][name] for cell in cells) if cells else "-"
 
 
 def main(line: list[str] | None = None) -> None:

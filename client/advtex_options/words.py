@@ -19,7 +19,7 @@ PRESET_HELP: dict[Preset, str] = {
     Preset.auto: "best and fast on every device: gabor, one photograph per face, sharpened by all of them",
     Preset.paper: "adversarial as in the paper, from the mean of all photographs, no refined cameras, 50,000 steps",
     Preset.full: "adversarial, from the best photograph per face, 50,000 steps; for GPUs",
-    Preset.standard: "adversarial, from the best photograph per face, 1,500 steps; minutes on a CPU",
+    Preset.standard: "adversarial, from the best photograph per face, 750 steps; minutes on a CPU",
     Preset.preview: "adversarial, from the best photograph per face, coarse to fine; two minutes on a CPU",
 }
 
@@ -28,6 +28,6 @@ PRESET_COST: dict[Preset, str] = {
     Preset.auto: "about a minute for views of 320x240 on 2 CPU cores, 3 minutes for 640x480",
     Preset.paper: "about 2 hours for views of 320x240 on 2 CPU cores, 8 hours for 640x480; much less on a GPU",
     Preset.full: "about 2 hours for views of 320x240 on 2 CPU cores, 8 hours for 640x480; much less on a GPU",
-    Preset.standard: "about 3 minutes for views of 320x240 on 2 CPU cores, 5 minutes for 640x480",
-    Preset.preview: "about 2 minutes for views of 320x240 on 2 CPU cores, 4 minutes for 640x480",
+    Preset.standard: "about 2 minutes for views of 320x240 on 2 CPU cores, 4 minutes for 640x480",
+    Preset.preview: "about a minute for views of 320x240 on 2 CPU cores, 3 minutes for 640x480",
 }

@@ -390,11 +390,20 @@ def test_auto_is_standard_on_a_cpu_and_full_on_a_gpu() -> None:
 
 
 def test_a_shorter_run_is_the_same_in_proportion() -> None:
-    shorter = resolve_preset(TextureConfig(preset="preview", steps=550), "cpu")
+    shorter = resolve_preset(TextureConfig(preset="preview", steps=275), "cpu")
     whole = PRESETS["preview"]
-    assert whole.steps == 1_100
-    assert [level.steps for level in shorter.levels] == [400, 150]
+    assert whole.steps == 550
+    assert [level.steps for level in shorter.levels] == [200, 75]
     assert (shorter.pretraining, shorter.averaging) == (whole.pretraining // 2, whole.averaging // 2)
+    assert (shorter.lr_texture, shorter.lr_discriminator) == (whole.lr_texture, whole.lr_discriminator)
+
+
+@pytest.mark.parametrize(("name", "smaller"), [("standard", 4), ("preview", 4), ("full", 4), ("paper", 1)])
+def test_more_steps_from_a_sharp_start_are_smaller_ones(name: str, smaller: int) -> None:
+    whole = PRESETS[name]
+    longer = resolve_preset(TextureConfig(preset=name, steps=4 * whole.steps), "cpu")
+    assert longer.lr_texture == pytest.approx(whole.lr_texture / smaller)
+    assert longer.lr_discriminator == pytest.approx(whole.lr_discriminator / smaller)
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,8 @@ PRESET = dataclasses.replace(
     PRESETS["standard"], levels=(PyramidLevel(STEPS),), pretraining=6, averaging=20, max_crop=(24, 24), alignment=False
 )
 
+LONG = dataclasses.replace(PRESETS["standard"], levels=(PyramidLevel(1_500),), pretraining=150)
+
 
 class Dead(PatchDiscriminator):
     """All weights are zero, and stay so: nothing has a gradient."""
@@ -164,7 +166,7 @@ def test_a_perfect_discriminator_is_told_and_how_often_it_rested() -> None:
 
 
 def told(*shares: float) -> list[dict[str, Any]]:
-    """A history of `standard` in which each twentieth of its steps, five points each, has a share of its own."""
+    """A history of LONG in which each twentieth of its steps, five points each, has a share of its own."""
     points = []
     for part, share in enumerate(shares):
         for fifth in range(5):
@@ -175,21 +177,19 @@ def told(*shares: float) -> list[dict[str, Any]]:
 
 
 def test_one_that_learns_in_its_pretraining_and_tells_some_apart_is_no_problem() -> None:
-    standard = PRESETS["standard"]
     points = told(0.5, 0.6, *[0.62] * 18)
-    assert problems(points, standard) == []
-    assert len(stretches(points, standard.pretraining, standard.steps)) == 19
-    assert recent_accuracy(points, standard.steps) == pytest.approx(0.62)
-    assert summary(points, standard)["at_chance"] == 0
+    assert problems(points, LONG) == []
+    assert len(stretches(points, LONG.pretraining, LONG.steps)) == 19
+    assert recent_accuracy(points, LONG.steps) == pytest.approx(0.62)
+    assert summary(points, LONG)["at_chance"] == 0
 
 
 def test_a_twentieth_of_the_run_is_enough_for_a_warning_that_says_where() -> None:
-    standard = PRESETS["standard"]
-    (problem,) = problems(told(0.5, 0.6, *[0.62] * 8, 0.54, *[0.7] * 4, 0.5, *[0.7] * 4), standard)
+    (problem,) = problems(told(0.5, 0.6, *[0.62] * 8, 0.54, *[0.7] * 4, 0.5, *[0.7] * 4), LONG)
     assert problem.where == "steps 751 to 1200 of 1500, in 150 of these steps"
     assert "52% of the patches" in problem.message
     assert "it has not learned yet, or the texture fools it" in problem.message
-    certain, chance = problems(told(0.5, 0.5, *[0.97] * 18), standard)[::-1]
+    certain, chance = problems(told(0.5, 0.5, *[0.97] * 18), LONG)[::-1]
     assert (chance.where, chance.code) == (
         "steps 76 to 150 of 1500, at the end of its pretraining too",
         "discriminator_at_chance",

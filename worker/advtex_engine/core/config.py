@@ -130,11 +130,12 @@ PAPER = replace(
 # From a sharp start the paper's weights blur: the L1 term only holds on to the start, features are matched, and the
 # discriminator has been trained before the texture listens to it.
 STANDARD = Preset(
-    levels=(PyramidLevel(1_500),),
+    levels=(PyramidLevel(750),),
     start="selection",
     toned=True,
-    pretraining=150,
-    lr_texture=4e-4,
+    pretraining=75,
+    # Twice the steps at half of it take .4 % more off the LPIPS of five scans (corrected, nothing).
+    lr_texture=8e-4,
     lr_discriminator=8e-4,
     lr_end=0.05,
     l1_weight=1.0,
@@ -142,8 +143,8 @@ STANDARD = Preset(
     l1_decays=0,
     feature_weight=10.0,
     gabor_weight=5.0,
-    averaging=1_000,
-    turn=60,
+    averaging=500,
+    turn=30,
     alignment=True,
     max_crop=(384, 288),
 )
@@ -162,7 +163,7 @@ PRESETS: dict[str, Preset] = {
     ),
     "standard": STANDARD,
     "preview": replace(
-        STANDARD, levels=(PyramidLevel(800, scale=2), PyramidLevel(300)), pretraining=120, averaging=100, turn=40
+        STANDARD, levels=(PyramidLevel(400, scale=2), PyramidLevel(150)), pretraining=60, averaging=50, turn=20
     ),
 }
 
@@ -204,7 +205,11 @@ class TextureConfig(Options):
 
 
 def resolve_preset(config: TextureConfig, device_type: str) -> Preset:
-    """The preset's numbers, "auto" decided by the device ("cpu" or "cuda") and the steps overridden where asked."""
+    """The preset's numbers, "auto" decided by the device ("cpu" or "cuda") and the steps overridden where asked.
+
+    From a sharp start more steps than the preset's take smaller ones: further on the texture fits what is blurred in
+    the photographs. The paper's steps are as long as they are.
+    """
     name = config.preset
     if name == "auto":
         name = "full" if device_type == "cuda" else "standard"
@@ -215,4 +220,7 @@ def resolve_preset(config: TextureConfig, device_type: str) -> Preset:
     levels = [PyramidLevel(round(level.steps * share), level.scale) for level in preset.levels]
     levels[-1] = PyramidLevel(config.steps - sum(level.steps for level in levels[:-1]), levels[-1].scale)
     pretraining, averaging, turn = (int(n * share) for n in (preset.pretraining, preset.averaging, preset.turn))
-    return replace(preset, levels=tuple(levels), pretraining=pretraining, averaging=averaging, turn=turn)
+    preset = replace(preset, levels=tuple(levels), pretraining=pretraining, averaging=averaging, turn=turn)
+    if preset.start != "selection" or share <= 1:
+        return preset
+    return replace(preset, lr_texture=preset.lr_texture / share, lr_discriminator=preset.lr_discriminator / share)

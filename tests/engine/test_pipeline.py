@@ -390,10 +390,10 @@ def test_auto_is_standard_on_a_cpu_and_full_on_a_gpu() -> None:
 
 
 def test_a_shorter_run_is_the_same_in_proportion() -> None:
-    shorter = resolve_preset(TextureConfig(preset="preview", steps=275), "cpu")
+    shorter = resolve_preset(TextureConfig(preset="preview", steps=550), "cpu")
     whole = PRESETS["preview"]
-    assert whole.steps == 550
-    assert [level.steps for level in shorter.levels] == [200, 75]
+    assert whole.steps == 1_100
+    assert [level.steps for level in shorter.levels] == [400, 150]
     assert (shorter.pretraining, shorter.averaging) == (whole.pretraining // 2, whole.averaging // 2)
     assert (shorter.lr_texture, shorter.lr_discriminator) == (whole.lr_texture, whole.lr_discriminator)
 

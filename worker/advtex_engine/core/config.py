@@ -163,7 +163,12 @@ PRESETS: dict[str, Preset] = {
     ),
     "standard": STANDARD,
     "preview": replace(
-        STANDARD, levels=(PyramidLevel(400, scale=2), PyramidLevel(150)), pretraining=60, averaging=50, turn=20
+        STANDARD,
+        levels=(PyramidLevel(800, scale=2), PyramidLevel(300)),
+        pretraining=120,
+        lr_texture=4e-4,
+        averaging=100,
+        turn=40,
     ),
 }
 

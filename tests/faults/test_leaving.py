@@ -116,9 +116,12 @@ def test_a_job_whose_scan_was_downloaded_ahead_is_nobodys(
         data = write_zip(tmp_path / "scan.zip", scan).read_bytes()
         with httpx.Client(base_url=running.urls[0], headers={"Authorization": f"Bearer {key}"}, timeout=30) as http:
             uploads = [http.post("/v1/uploads", content=data).json()["id"] for _ in range(2)]
-            options = [{"steps": 2500}, {"steps": 10}]
-            bodies = [{"upload_id": upload, "options": given} for upload, given in zip(uploads, options, strict=True)]
-            first, second = (str(http.post("/v1/jobs", json=body).json()["id"]) for body in bodies)
+            jobs = []
+            for upload, steps in zip(uploads, (2500, 10), strict=True):
+                body = {"upload_id": upload, "options": {"steps": steps}}
+                jobs.append(str(http.post("/v1/jobs", json=body).json()["id"]))
+                wait_until(lambda: records.job(jobs[0]).state == JobState.running, 60)  # else the other may overtake it
+            first, second = jobs
         cached = [place.data / "scans" / f"{upload}.zip" for upload in uploads]
         wait_until(lambda: all(path.exists() for path in cached), 60)
         row = records.job(second)

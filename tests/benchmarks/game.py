@@ -200,7 +200,7 @@ def _input(
         device=arguments.device,
     )
     given = prepare(scan, config, folder / "work", device)
-    preset = dataclasses.replace(resolve_preset(config, device.type), **changes(arguments.change))
+    preset = dataclasses.replace(resolve_preset(config), **changes(arguments.change))
     return dataclasses.replace(given, preset=preset)
 
 

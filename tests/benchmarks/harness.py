@@ -119,7 +119,7 @@ def prepare(scan: Path, config: TextureConfig, work: Path, device: torch.device,
     atlas = build_atlas(scene.mesh, [view.camera for view in scene.views], config, monitor)
     atlas = dataclasses.replace(atlas, mesh=moved(atlas.mesh, device))
     maps = build_view_maps(atlas, scene.views, scene.kind)
-    preset = resolve_preset(config, device.type)
+    preset = resolve_preset(config)
     folder = WorkFolder(work, "", monitor)
     live = Live(scene, atlas, monitor)
     return MethodInput(scene, atlas, {1: maps}, {1: mean_texture(maps)}, preset, config, monitor, folder, live)

@@ -341,7 +341,7 @@ def fill(arguments: argparse.Namespace, results: Results) -> None:
         device=arguments.device,
     )
     preset = dataclasses.replace(
-        resolve_preset(config, device.type), pretraining=arguments.steps, feature_weight=0.0, gabor_weight=0.0
+        resolve_preset(config), pretraining=arguments.steps, feature_weight=0.0, gabor_weight=0.0
     )
     starts = dict[tuple[Path, bool], MethodInput]()
 

@@ -251,7 +251,7 @@ def _run(
     if key not in inputs:
         inputs.clear()
         inputs[key] = prepare(scan, config, work, device)
-    preset = dataclasses.replace(resolve_preset(config, device.type), **row.preset)
+    preset = dataclasses.replace(resolve_preset(config), **row.preset)
     given = dataclasses.replace(inputs[key], config=config, preset=preset)
     watch = Stopwatch()
     with ExitStack() as stack:

@@ -189,7 +189,7 @@ def textures(
             with patched(variant.prepared):
                 inputs[shared] = prepare(scan, changed, work, device), watch.seconds
         given, before = inputs[shared]
-        preset = dataclasses.replace(resolve_preset(changed, device.type), **variant.changes)
+        preset = dataclasses.replace(resolve_preset(changed), **variant.changes)
         given = dataclasses.replace(given, config=changed, preset=preset)
         watch = Stopwatch()
         with patched(variant.code):

@@ -171,7 +171,7 @@ def _input(arguments: argparse.Namespace, scan: Path, holdout: int | None, folde
         seed=arguments.seed,
     )
     given = prepare(scan, config, folder / "work", device)
-    preset = resolve_preset(config, device.type)
+    preset = resolve_preset(config)
     preset = dataclasses.replace(preset, turn=arguments.turn or preset.turn, **changes(arguments.change))
     return dataclasses.replace(given, preset=preset)
 

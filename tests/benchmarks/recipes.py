@@ -188,7 +188,7 @@ def begun(scan: Path, config: TextureConfig, device: torch.device) -> MethodInpu
     """The scan before its optimization; its work folder is gone."""
     with tempfile.TemporaryDirectory(prefix="advtex-recipes-") as folder:
         given = prepare(scan, config, Path(folder), device)
-        return started(dataclasses.replace(given, preset=resolve_preset(config, device.type)))
+        return started(dataclasses.replace(given, preset=resolve_preset(config)))
 
 
 def learned_elsewhere(arguments: argparse.Namespace, scan: Path, device: torch.device) -> PatchDiscriminator:
@@ -212,7 +212,7 @@ def fill(arguments: argparse.Namespace, results: Results) -> None:
         config = configured(arguments, arguments.size)
         with tempfile.TemporaryDirectory(prefix="advtex-recipes-") as folder:
             given = prepare(scan, config, Path(folder), device)
-            given = started(dataclasses.replace(given, preset=resolve_preset(config, device.type)))
+            given = started(dataclasses.replace(given, preset=resolve_preset(config)))
             for name in missing:
                 recipe = RECIPES[name]
                 if recipe.elsewhere:

@@ -89,9 +89,7 @@ def fill(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
             if (cell["every"], made) != used:
                 used, shown = (cell["every"], made), dict[str, Tensor]()
                 prepared = prepare(scan, config, Path(folder) / "work", device, cell["every"])
-            preset = dataclasses.replace(
-                resolve_preset(config, device.type), perturbation=PERTURBATION if virtual else 0.0
-            )
+            preset = dataclasses.replace(resolve_preset(config), perturbation=PERTURBATION if virtual else 0.0)
             given = dataclasses.replace(prepared, config=config, preset=preset)
             watch = Stopwatch()
             texture = run_method(given, config.method)

@@ -140,7 +140,7 @@ class _Scans:
         if self.refined != cell["refined"]:
             self.prepared = prepare(self.folder / "scan", config, self.folder / "work", self.device)
             self.refined = cell["refined"]
-        preset = resolve_preset(config, self.device.type)
+        preset = resolve_preset(config)
         return dataclasses.replace(self.prepared, config=config, preset=preset), self.truth
 
 

@@ -384,13 +384,13 @@ def test_the_mean_method_takes_no_steps(scan: Path, tmp_path: Path) -> None:
     assert models == {"model.obj", "model.mtl", "model.png", "model.glb", "model_seen.png", *asked_for}
 
 
-def test_auto_is_standard_on_a_cpu_and_full_on_a_gpu() -> None:
-    assert resolve_preset(TextureConfig(), "cpu") == PRESETS["standard"]
-    assert resolve_preset(TextureConfig(), "cuda") == PRESETS["full"]
+def test_what_plays_a_game_plays_standard_unless_asked_otherwise() -> None:
+    assert resolve_preset(TextureConfig(method="adversarial")) == PRESETS["standard"]
+    assert resolve_preset(TextureConfig(preset="full")) == PRESETS["full"]
 
 
 def test_a_shorter_run_is_the_same_in_proportion() -> None:
-    shorter = resolve_preset(TextureConfig(preset="preview", steps=550), "cpu")
+    shorter = resolve_preset(TextureConfig(preset="preview", steps=550))
     whole = PRESETS["preview"]
     assert whole.steps == 1_100
     assert [level.steps for level in shorter.levels] == [400, 150]
@@ -401,7 +401,7 @@ def test_a_shorter_run_is_the_same_in_proportion() -> None:
 @pytest.mark.parametrize(("name", "smaller"), [("standard", 4), ("preview", 4), ("full", 4), ("paper", 1)])
 def test_more_steps_from_a_sharp_start_are_smaller_ones(name: str, smaller: int) -> None:
     whole = PRESETS[name]
-    longer = resolve_preset(TextureConfig(preset=name, steps=4 * whole.steps), "cpu")
+    longer = resolve_preset(TextureConfig(preset=name, steps=4 * whole.steps))
     assert longer.lr_texture == pytest.approx(whole.lr_texture / smaller)
     assert longer.lr_discriminator == pytest.approx(whole.lr_discriminator / smaller)
 

@@ -213,5 +213,5 @@ def test_a_game_that_cannot_help_has_less_than_a_fifth_of_the_steps() -> None:
         spent = preset.pretraining + preset.patience * (preset.turn + 4)
         costs = sum(level.steps / level.scale**2 for level in preset.levels)
         assert spent / preset.levels[0].scale ** 2 < 0.2 * costs
-        half = resolve_preset(TextureConfig(preset=name, steps=preset.steps // 2), "cpu")
+        half = resolve_preset(TextureConfig(preset=name, steps=preset.steps // 2))
         assert half.turn == preset.turn // 2

@@ -177,7 +177,7 @@ PRESETS: dict[str, Preset] = {
 class TextureConfig(Options):
     """What one run is asked to do: the user's options, and what is the machine's or the engine's own.
 
-    preset            a name of PRESETS, or "auto": of what plays a game full on a GPU, standard on a CPU
+    preset            a name of PRESETS; "auto" is standard where a game is played
     method            its name, also where none is asked for
     size              working size (width, height) of the views in pixels; None keeps the scan's
     max_views         of a longer scan, these many frames are chosen; fewer where their maps would not fit into memory
@@ -209,16 +209,13 @@ class TextureConfig(Options):
                 raise OptionError(words)
 
 
-def resolve_preset(config: TextureConfig, device_type: str) -> Preset:
-    """The preset's numbers, "auto" decided by the device ("cpu" or "cuda") and the steps overridden where asked.
+def resolve_preset(config: TextureConfig) -> Preset:
+    """The preset's numbers, the steps overridden where asked.
 
     From a sharp start more steps than the preset's take smaller ones: further on the texture fits what is blurred in
     the photographs. The paper's steps are as long as they are.
     """
-    name = config.preset
-    if name == "auto":
-        name = "full" if device_type == "cuda" else "standard"
-    preset = PRESETS[name]
+    preset = PRESETS["standard" if config.preset == "auto" else config.preset]
     if config.steps is None:
         return preset
     share = config.steps / preset.steps

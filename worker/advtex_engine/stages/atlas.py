@@ -27,7 +27,7 @@ def fitting_atlas(scene: Scene, budget: Budget, stages: Stages, charts: ChartMak
     MemoryShortage when no texture fits that holds the charts.
     """
     device = budget.device
-    preset = resolve_preset(budget.config, device.type)
+    preset = resolve_preset(budget.config)
     while True:
         try:
             atlas = _cached_atlas(scene, budget.texture_config(), budget.texture_folder(), stages, charts)

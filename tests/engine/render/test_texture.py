@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch import Tensor
 
 from advtex_engine.render.texture import (
+    area_footprint,
     bilinear_footprint,
     decode_uv,
     encode_uv,
@@ -50,6 +54,49 @@ def test_values_and_gradients_equal_grid_sample(width: int, height: int) -> None
     assert values.shape == (slots, 3)
     torch.testing.assert_close(gradient, gradient_twin[slot_map >= 0], atol=1e-4, rtol=1e-4)
     assert gradient_twin[slot_map < 0].abs().sum() == 0
+
+
+def pixels(width: int, height: int) -> Tensor:
+    """[height,width,2], the pixels' middles."""
+    x, y = torch.meshgrid(torch.arange(width) + 0.5, torch.arange(height) + 0.5, indexing="xy")
+    return torch.stack((x, y), -1)
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.floats(0.2, 1.8), st.floats(0, 6.3), st.integers(0, 2**31 - 1))
+def test_what_a_pixel_shows_is_the_mean_of_samples_all_over_it(scale: float, turn: float, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    image = torch.rand(40, 50, 3, generator=generator)
+    place = torch.tensor([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    place *= scale / (abs(math.cos(turn)) + abs(math.sin(turn)))
+    offset = torch.rand(2, generator=generator) * 30 + 10
+    texels, weights = area_footprint(pixels(8, 6) @ place.T + offset, torch.ones(6, 8, dtype=torch.bool), 50, 40)
+    samples = [pixels(8, 6) + torch.tensor([x, y]) for x in (-0.25, 0.25) for y in (-0.25, 0.25)]
+    expected = torch.stack([sample_image(image, (at @ place.T + offset).view(-1, 2)) for at in samples]).mean(0)
+    torch.testing.assert_close((image.view(-1, 3)[texels] * weights[..., None]).sum(1), expected, atol=1e-4, rtol=1e-4)
+
+
+def test_a_pixel_at_the_border_of_a_chart_is_as_wide_as_the_one_beside_it() -> None:
+    """Left of the border charts run one way, right of it another lies elsewhere; further right nothing is seen."""
+    xy = pixels(9, 4) + 3
+    whole = area_footprint(xy, torch.ones(4, 9, dtype=torch.bool), 40, 30)
+    seen = torch.ones(4, 9, dtype=torch.bool)
+    seen[:, 7:] = False
+    cut = xy.clone()
+    cut[:, 4:] += 20
+    cut[:, 7:] = 0
+    texels, weights = (part.view(4, 9, 9) for part in area_footprint(cut, seen, 40, 30))
+    for part, expected in zip((texels, weights), whole, strict=True):
+        assert torch.equal(part[:, :4], expected.view(4, 9, 9)[:, :4])
+    assert torch.equal(texels[:, 4:7] - 20 * 41, whole[0].view(4, 9, 9)[:, 4:7])
+    torch.testing.assert_close(weights[:, 4:7], whole[1].view(4, 9, 9)[:, 4:7])
+
+
+def test_areas_wider_than_their_cells_and_beyond_the_texture_have_whole_weights() -> None:
+    texels, weights = area_footprint(pixels(20, 15) * 3.5 - 10, torch.ones(15, 20, dtype=torch.bool), 30, 20)
+    assert texels.min() >= 0 and texels.max() < 600
+    assert weights.min() >= 0
+    torch.testing.assert_close(weights.sum(1), torch.ones(300))
 
 
 def test_sample_image_equals_grid_sample_outside_the_centers_too() -> None:

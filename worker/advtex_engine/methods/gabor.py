@@ -3,7 +3,8 @@
 Each step compares a view's photograph with the texture's render by Gabor energies (`adversarial/gabor.py`), which
 forgive some pixels, so that every view adds to a texture that begins as a patchwork of single ones. Energies say
 nothing of colors, and nothing of what is wider than their coarsest octave: there means over blocks are compared, which
-some pixels of displacement hardly change either.
+some pixels of displacement hardly change either. The render's pixels are means over what they show, as a photograph's
+are: values at their middles would make a texture that is as soft as these means, and softer still when it is shown.
 """
 
 from __future__ import annotations
@@ -16,14 +17,15 @@ from advtex_engine.adversarial.gabor import gabor_filters, gabor_loss
 from advtex_engine.adversarial.optimizer import crop_size
 from advtex_engine.methods.descent import descend, drawn_views
 from advtex_engine.methods.inputs import LossPoint, MethodInput
-from advtex_engine.render.texture import bilinear_footprint, decode_uv, sample_texels
+from advtex_engine.render.texture import area_footprint, decode_uv, sample_texels
 from advtex_engine.render.view_maps import ViewMaps
 
-PASSES = 10  # over all views, unless the number of steps is asked for
+PASSES = 5  # over all views, unless the number of steps is asked for
 REACH = 1e-2
 """Rate of the first step times the passes, in colors of [0, 1]: how far texels may go. Further on they fit photographs
 that are blurred, whatever the rate is, and edges soften; more steps take smaller ones."""
 MAX_LR = 2e-3  # larger steps leave grain
+LEAST_WEIGHT = 1e-6  # of a pixel's texels; some are owned where a view shows the surface
 BLOCK = 8  # pixels a side, of which means are compared; every half of it
 
 
@@ -63,13 +65,15 @@ def wide_loss(render: Tensor, photograph: Tensor, foreground: Tensor) -> Tensor:
 def _seen(
     view: ViewMaps, corner: list[int], crop: tuple[int, int], size: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """A crop of one view: photograph [1,3,h,w] in [-1,1], foreground [1,1,h,w], slots [h*w,4] and weights [h*w,4]."""
+    """A crop of one view: photograph [1,3,h,w] in [-1,1], foreground [1,1,h,w], slots [h*w,9] and weights [h*w,9]."""
     (left, top), (width, height) = corner, crop
     window = (slice(top, top + height), slice(left, left + width))
     color, uv = (part.view(view.height, view.width, -1)[window] for part in (view.color, view.uv))
     foreground = view.depth.view(view.height, view.width)[window] > 0
-    texels, weights = bilinear_footprint(decode_uv(uv.reshape(-1, 2)) * size, *reversed(view.slot_map.shape))
-    # A background pixel's weight is 0, so any row may stand for the texel that nobody owns.
-    slots = view.slot_map.flatten().index_select(0, texels.flatten()).view(texels.shape).clamp(min=0)
+    texels, weights = area_footprint(decode_uv(uv) * size, foreground, *reversed(view.slot_map.shape))
+    slots = view.slot_map.flatten().index_select(0, texels.flatten()).view(texels.shape)
+    # Texels that nobody owns lie beyond a chart's border.
+    weights = weights * ((slots >= 0) & foreground.reshape(-1, 1))
+    weights = weights / weights.sum(1, keepdim=True).clamp(min=LEAST_WEIGHT)
     photograph = color.permute(2, 0, 1)[None].to(torch.float32) / 127.5 - 1
-    return photograph, foreground[None, None], slots, weights * foreground.reshape(-1, 1)
+    return photograph, foreground[None, None], slots.clamp(min=0), weights

@@ -18,6 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 UV_LEVELS = 65535
+FAR_APART = 4.0  # texels between what neighboring pixels show, beyond which they show different charts
 
 
 def encode_uv(uv: Tensor) -> Tensor:
@@ -51,6 +52,49 @@ def bilinear_footprint(xy: Tensor, width: int, height: int) -> tuple[Tensor, Ten
     return indices, weights
 
 
+def area_footprint(xy: Tensor, seen: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """The 3 x 3 grid cells around what each pixel shows, and their weights: its area's mean, not its middle's value.
+
+    A photograph's pixel is the mean of what lies before it, and so is a renderer's with several samples; a texture that
+    is compared with photographs at the pixels' middles alone learns to be as soft as these means. Four bilinear samples
+    half a pixel apart stand for the area; of areas that are wider than two cells, the inner two.
+
+    xy: [h,w,2] positions of the pixels' middles in cells, as in `bilinear_footprint`; seen: [h,w] bool, where they mean
+    something. A grid of 3 x 3 cells or more. Returns indices [h*w,9] int64 and weights [h*w,9], row by row. Not
+    differentiable with respect to xy.
+    """
+    assert xy.ndim == 3 and min(width, height) >= 3
+    right, down = (_steps(xy, seen, axis).view(-1, 2).T / 4 for axis in (1, 0))
+    inner = 0.5 / (right.abs() + down.abs()).clamp(min=0.5)
+    right, down = right * inner, down * inner
+    middle = xy.view(-1, 2).T - 0.5
+    most = torch.tensor([[width - 1.0], [height - 1.0]], device=xy.device)
+    first = (middle - right.abs() - down.abs()).floor().clamp(min=0).minimum(most - 2)
+    samples = torch.stack((middle - right - down, middle + right - down, middle - right + down, middle + right + down))
+    place = samples.clamp(min=0).minimum(most) - first  # of samples in the 3 x 3 cells, [4,2,h*w] in [0,2]
+    before, after = (1 - place).clamp(min=0), (place - 1).clamp(min=0)
+    shares = torch.stack((before, 1 - before - after, after))  # of the cells along each axis
+    weights = [(down * right).mean(0) for down in shares[:, :, 1] for right in shares[:, :, 0]]
+    corner = first[1].long() * width + first[0].long()
+    cells = torch.arange(3, device=xy.device)
+    return corner[:, None] + (cells[:, None] * width + cells).flatten(), torch.stack(weights, 1)
+
+
+def _steps(xy: Tensor, seen: Tensor, axis: int) -> Tensor:
+    """[h,w,2] how far apart is what a pixel and the next along the axis show: the nearer of both neighbors counts, and
+    it is 0 where neither shows the same surface."""
+    step = xy.diff(dim=axis)
+    count = step.shape[axis]
+    same = seen.narrow(axis, 0, count) & seen.narrow(axis, 1, count)
+    length = step.abs().amax(-1)
+    length = torch.where(same & (length <= FAR_APART), length, torch.inf)
+    nothing = torch.zeros_like(xy.narrow(axis, 0, 1))
+    far = torch.full_like(nothing[..., 0], torch.inf)
+    before, after = torch.cat((far, length), axis), torch.cat((length, far), axis)
+    found = torch.where((before < after)[..., None], torch.cat((nothing, step), axis), torch.cat((step, nothing), axis))
+    return torch.where(before.minimum(after).isfinite()[..., None], found, 0.0)
+
+
 class _SampleTexels(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, slots: Tensor, weights: Tensor) -> Tensor:
@@ -73,12 +117,12 @@ class _SampleTexels(torch.autograd.Function):
 
 
 def sample_texels(values: Tensor, slots: Tensor, weights: Tensor) -> Tensor:
-    """Weighted sum of four texels per pixel: values [N,C], slots [P,4] integer, weights [P,4] -> [P,C].
+    """Weighted sum of some texels per pixel: values [N,C], slots [P,K] integer, weights [P,K] -> [P,C].
 
-    Differentiable with respect to `values` only. Same as grid_sample (bilinear, border, align_corners=False) on the
-    dense texture, without touching the texels that no pixel needs.
+    Differentiable with respect to `values` only. With the four of `bilinear_footprint` the same as grid_sample
+    (bilinear, border, align_corners=False) on the dense texture, without touching the texels that no pixel needs.
     """
-    assert values.ndim == 2 and slots.shape == weights.shape and slots.shape[1] == 4
+    assert values.ndim == 2 and slots.ndim == 2 and slots.shape == weights.shape
     out: Tensor = _SampleTexels.apply(values, slots, weights)  # type: ignore[no-untyped-call]
     return out
 

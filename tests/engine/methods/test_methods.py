@@ -36,6 +36,7 @@ from advtex_engine.render.pairs import own_pairs
 from advtex_engine.render.rasterize import rasterize
 from advtex_engine.render.render_view import render_view
 from advtex_engine.render.texels import map_texels
+from advtex_engine.render.texture import sample_texels
 from advtex_engine.render.view_maps import build_view_maps
 from advtex_engine.runtime.checkpoint import WorkFolder
 from advtex_engine.synthetic.patches import look_at
@@ -342,6 +343,33 @@ def test_the_wide_term_is_the_difference_of_means_over_blocks() -> None:
     assert bool((pull[(foreground == 0).expand_as(pull)] == 0).all())
     corner = pull[0, 0, : BLOCK // 2, : BLOCK // 2][foreground[0, 0, : BLOCK // 2, : BLOCK // 2] > 0]
     torch.testing.assert_close(corner, corner[:1].expand_as(corner))
+
+
+@pytest.mark.parametrize(("blurred", "areas"), [(False, True), (True, False)])
+def test_gabor_renders_means_over_pixels_unless_the_start_is_sharper_than_photographs(
+    blurred: bool, areas: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fine = torch.rand((1, 3, SIDE // 3, SIDE // 3), generator=torch.Generator().manual_seed(4))
+    picture = F.interpolate(fine, (SIDE, SIDE), mode="bilinear")[0].permute(1, 2, 0)
+    shown = photographed(picture)
+    photograph = photographed(photographed(shown)) if blurred else shown
+    maps = planar_maps((photograph * 255).round().to(torch.uint8).expand(3, -1, -1, -1).contiguous(), SIDE, SIDE)
+    expected = sum(shown.diff(dim=axis).abs().sum() for axis in (0, 1)) / sum(
+        photograph.diff(dim=axis).abs().sum() for axis in (0, 1)
+    )
+    assert gabor.sharpness(picture, maps) == pytest.approx(float(expected), abs=0.02)
+    given = task(plane(), (view("0", plane(), truth(), camera((0.5, 0.45, 1.0))),), tmp_path)
+    config = TextureConfig(method="gabor", steps=3)
+    given = replace(given, maps={1: maps}, means={1: mean_texture(maps)}, start=picture, config=config)
+    texels = list[int]()
+
+    def sample(values: Tensor, slots: Tensor, weights: Tensor) -> Tensor:
+        texels.append(slots.shape[1])
+        return sample_texels(values, slots, weights)
+
+    monkeypatch.setattr(gabor, "sample_texels", sample)
+    gabor.gabor(given)
+    assert texels == [9] * 3 + [9 if areas else 4] * 3
 
 
 def test_gabor_takes_what_is_wide_from_all_photographs_and_keeps_detail(tmp_path: Path) -> None:

@@ -53,7 +53,7 @@ from advtex_engine.adversarial.game import CHANCE
 from advtex_engine.adversarial.optimizer import AdversarialOptimizer
 from advtex_engine.core.config import PRESETS, Preset, TextureConfig, resolve_preset
 from advtex_engine.methods import MethodInput
-from advtex_engine.methods.adversarial import pairs_of, rated
+from advtex_engine.methods.adversarial import fitted, pairs_of
 from advtex_engine.methods.mean import dense_texture
 from advtex_engine.metrics.lpips import Lpips
 from advtex_engine.metrics.speckle import speckle_share
@@ -139,7 +139,7 @@ def play(
         maps,
         pairs_of(given, maps),
         start[maps.slot_map >= 0],
-        rated(preset, maps, start),
+        fitted(preset, maps, start),
         kind=given.scene.kind,
         steps=preset.steps,
         generator=torch.Generator(maps.device).manual_seed(given.config.seed),

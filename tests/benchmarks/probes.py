@@ -44,7 +44,7 @@ from advtex_engine.adversarial.probes import LeftOutCells, Probes
 from advtex_engine.adversarial.unlikeness import Unlikeness, structure_unlikeness
 from advtex_engine.core.config import PRESETS, Preset, TextureConfig, resolve_preset
 from advtex_engine.methods import MethodInput
-from advtex_engine.methods.adversarial import pairs_of, rated
+from advtex_engine.methods.adversarial import fitted, pairs_of
 from advtex_engine.methods.mean import dense_texture
 from advtex_engine.metrics.evaluate import score_views
 from advtex_engine.metrics.lpips import Lpips
@@ -92,7 +92,7 @@ def play(given: MethodInput, lpips: Lpips, score: Score, results: Results, setti
         maps,
         pairs,
         start[maps.slot_map >= 0],
-        rated(preset, maps, start),
+        fitted(preset, maps, start),
         kind=given.scene.kind,
         steps=preset.steps,
         generator=torch.Generator(maps.device).manual_seed(given.config.seed),
@@ -105,7 +105,7 @@ def play(given: MethodInput, lpips: Lpips, score: Score, results: Results, setti
     measures: dict[str, Unlikeness] = {"LPIPS": lpips.to(maps.device).maps, "structure": structure_unlikeness}
     judges = {
         name: Probes(
-            LeftOutCells(maps, painted, measure),
+            LeftOutCells(maps, painted, measure, areas=optimizer.preset.areas),
             sources,
             leave_out,  # twice the same
             judged_by=name,

@@ -70,13 +70,14 @@ def rough(maps: ViewMaps) -> ViewMaps:
     return dataclasses.replace(maps, depth=depth.half().to(DEVICE), intrinsics=intrinsics, slot_map=slot_map)
 
 
-@pytest.mark.parametrize("perturbation", [0.0, 3.0])
-def test_a_pair_is_drawn_and_warped_as_by_torch(fused: ModuleType, perturbation: float) -> None:
+@pytest.mark.parametrize(("perturbation", "areas"), [(0.0, True), (3.0, False)])
+def test_a_pair_is_drawn_and_warped_as_by_torch(fused: ModuleType, perturbation: float, areas: bool) -> None:
     maps, pairs = planar_views(4, 90, 70, 1.2, DEVICE)
     generator = torch.Generator().manual_seed(1)
     relative = pairs.relative + 0.01 * torch.randn(pairs.relative.shape, generator=generator).to(DEVICE)
     pairs = dataclasses.replace(pairs, relative=relative)
-    sampler = PairSampler(rough(maps), pairs, "scene", (56, 48), torch.Generator(DEVICE).manual_seed(0), perturbation)
+    generator = torch.Generator(DEVICE).manual_seed(0)
+    sampler = PairSampler(rough(maps), pairs, "scene", (56, 48), generator, perturbation, areas=areas)
     for _ in range(2):
         before = sampler.generator.get_state()
         plain = sampler.draw()
@@ -96,10 +97,11 @@ def test_a_pair_is_drawn_and_warped_as_by_torch(fused: ModuleType, perturbation:
         torch.testing.assert_close(ours.weights, plain.weights)
 
 
-def test_a_texture_is_sampled_as_by_torch(fused: ModuleType) -> None:
+@pytest.mark.parametrize("taps", [4, 9])
+def test_a_texture_is_sampled_as_by_torch(fused: ModuleType, taps: int) -> None:
     generator = torch.Generator().manual_seed(0)
-    slots = torch.randint(0, 50, (700, 4), dtype=torch.int32, generator=generator).to(DEVICE)
-    weights = torch.rand((700, 4), generator=generator).to(DEVICE)
+    slots = torch.randint(0, 50, (700, taps), dtype=torch.int32, generator=generator).to(DEVICE)
+    weights = torch.rand((700, taps), generator=generator).to(DEVICE)
     weights[::5] = 0
     values, twin = (torch.rand((50, 3), generator=generator).to(DEVICE).requires_grad_() for _ in range(2))
     twin.data.copy_(values.data)
@@ -463,11 +465,12 @@ SIZES = dict(
     COLUMNS=12, ROWS=12, FREE_X=65, FREE_Y=65, WIDTH=640, HEIGHT=480, CROP=576, PIXELS=576 * 416, TEXTURE_WIDTH=2048,
     TEXTURE_HEIGHT=2048, CHANNELS=8, CONDITIONED=True, MOVED=True, WITH_MOVED=True, COUNT=10**6, BLOCK=256,
     JUDGED=True, DRAWN=True, PARTS=1000, SIDE=64, VALUES=10**6, BOUND=5, MIN_SEEN=0.6, MIN_CORRELATION=0.25,
-    MIN_GAIN=1.15, OCTAVES=3, WINDOWS=10**4,
+    MIN_GAIN=1.15, OCTAVES=3, WINDOWS=10**4, AREAS=True, TAPS=9,
 )
-# Not moved is how the published method's step runs; without a condition, its ablation; fp32, cards without bf16.
+# Not moved, and at pixels' middles, is how the published step runs; without a condition, its ablation; fp32, cards
+# without bf16.
 OTHERS = {"assemble": ("MOVED", "CONDITIONED"), "assemble_backward": ("MOVED", "WITH_MOVED")}
-OTHERS |= {"judge_backward": ("JUDGED", "DRAWN")}
+OTHERS |= {"judge_backward": ("JUDGED", "DRAWN"), "draw": ("AREAS",)}
 variants = [(name, types, {}) for name, types in TYPES.items()]
 variants += [
     (name, TYPES[name].replace("bf16", "fp32"), {one: False}) for name, flags in OTHERS.items() for one in flags
@@ -498,7 +501,7 @@ def test_the_kernels_compile_for_gpus_that_are_not_here(tmp_path: Path, capabili
         [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=300, env=environment
     )
     assert done.returncode == 0, done.stderr
-    assert len(done.stdout.splitlines()) == 30
+    assert len(done.stdout.splitlines()) == 31
 
 
 def test_every_kernel_describes_its_parameters(fused: ModuleType) -> None:

@@ -280,8 +280,11 @@ def photographed(picture: Tensor) -> Tensor:
     return picture
 
 
-def test_gabor_keeps_what_is_sharp_and_sharpens_the_rest_where_photographs_are_displaced(tmp_path: Path) -> None:
+def test_gabor_keeps_what_is_sharp_and_sharpens_the_rest_where_photographs_are_displaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Photographs that are off by up to two pixels, each in its own direction; one half of the start is blurred."""
+    monkeypatch.setattr(gabor, "shows_areas", lambda _: True)
     fine = torch.rand((1, 3, SIDE // 3, SIDE // 3), generator=torch.Generator().manual_seed(4))
     picture = F.interpolate(fine, (SIDE, SIDE), mode="bilinear")[0].permute(1, 2, 0)
     shifts = list(itertools.product(range(-2, 3), repeat=2))
@@ -345,35 +348,32 @@ def test_the_wide_term_is_the_difference_of_means_over_blocks() -> None:
     torch.testing.assert_close(corner, corner[:1].expand_as(corner))
 
 
-@pytest.mark.parametrize(("blurred", "areas"), [(False, True), (True, False)])
-def test_gabor_renders_means_over_pixels_unless_the_start_is_sharper_than_photographs(
-    blurred: bool, areas: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("cell", "texels"), [(1, 9), (3, 4)])
+def test_gabor_renders_means_over_pixels_where_photographs_are_such_means(
+    cell: int, texels: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fine = torch.rand((1, 3, SIDE // 3, SIDE // 3), generator=torch.Generator().manual_seed(4))
+    fine = torch.rand((1, 3, SIDE // cell, SIDE // cell), generator=torch.Generator().manual_seed(4))
     picture = F.interpolate(fine, (SIDE, SIDE), mode="bilinear")[0].permute(1, 2, 0)
-    shown = photographed(picture)
-    photograph = photographed(photographed(shown)) if blurred else shown
-    maps = planar_maps((photograph * 255).round().to(torch.uint8).expand(3, -1, -1, -1).contiguous(), SIDE, SIDE)
-    expected = sum(shown.diff(dim=axis).abs().sum() for axis in (0, 1)) / sum(
-        photograph.diff(dim=axis).abs().sum() for axis in (0, 1)
-    )
-    assert gabor.sharpness(picture, maps) == pytest.approx(float(expected), abs=0.02)
+    maps = planar_maps((picture * 255).round().to(torch.uint8).expand(3, -1, -1, -1).contiguous(), SIDE, SIDE)
     given = task(plane(), (view("0", plane(), truth(), camera((0.5, 0.45, 1.0))),), tmp_path)
     config = TextureConfig(method="gabor", steps=3)
     given = replace(given, maps={1: maps}, means={1: mean_texture(maps)}, start=picture, config=config)
-    texels = list[int]()
+    seen = list[int]()
 
     def sample(values: Tensor, slots: Tensor, weights: Tensor) -> Tensor:
-        texels.append(slots.shape[1])
+        seen.append(slots.shape[1])
         return sample_texels(values, slots, weights)
 
     monkeypatch.setattr(gabor, "sample_texels", sample)
     gabor.gabor(given)
-    assert texels == [9] * 3 + [9 if areas else 4] * 3
+    assert seen == [texels] * 3
 
 
-def test_gabor_takes_what_is_wide_from_all_photographs_and_keeps_detail(tmp_path: Path) -> None:
+def test_gabor_takes_what_is_wide_from_all_photographs_and_keeps_detail(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Spots of twelve pixels that the start shows too dark, over fine print: the print is as sharp as before."""
+    monkeypatch.setattr(gabor, "shows_areas", lambda _: True)
     generator = torch.Generator().manual_seed(6)
     fine = F.interpolate(torch.rand((1, 1, SIDE // 3, SIDE // 3), generator=generator), (SIDE, SIDE), mode="bilinear")
     picture = (0.3 + 0.4 * fine[0, 0])[..., None].expand(-1, -1, 3).contiguous()

@@ -34,6 +34,7 @@ PRESET = replace(
     turn=TURN,
     max_crop=(24, 24),
     alignment=False,
+    areas=False,  # a texel per pixel: the picture is exact
 )
 
 

@@ -15,11 +15,12 @@ WIDTH, HEIGHT = 56, 50
 
 
 def maps_of(shifts: list[tuple[float, float]], truth: Tensor) -> ViewMaps:
-    """Views that look at the texture straight on, one pixel per texel, from these places; they show the truth."""
+    """Views that look at the texture straight on, one pixel per texel, from these places; they show means of the truth
+    over their pixels."""
     y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
     uv = torch.stack([(torch.stack((x + u, y + v), 2) / SIDE).view(-1, 2) for u, v in shifts])
-    # Twice bilinear between texels of the truth: no photograph is sharper.
-    color = torch.stack([sampled(truth, place) for place in uv])
+    quarters = [torch.tensor([u, v]) / 4 / SIDE for u in (-1, 1) for v in (-1, 1)]
+    color = torch.stack([torch.stack([sampled(truth, place + by) for by in quarters]).mean(0) for place in uv])
     count = len(shifts)
     slot_map, slots = number_slots(torch.ones((SIDE, SIDE), dtype=torch.bool))
     return ViewMaps(
@@ -71,7 +72,7 @@ def test_what_leveling_did_stays() -> None:
 def test_each_texel_hears_its_own_view_alone() -> None:
     truth = noise()
     maps = maps_of([(2.3, 1.6), (2.4, 1.7)], truth)
-    other = maps_of([(2.4, 1.7)], torch.rand((SIDE, SIDE, 3), generator=torch.Generator().manual_seed(3)))
+    other = maps_of([(2.4, 1.7)], noise().flip(0))  # as fine
     mixed = torch.stack((maps.color[0], other.color[0]))
     label = torch.zeros((SIDE, SIDE), dtype=torch.int64)
     label[:, SIDE // 2 :] = 1

@@ -15,6 +15,8 @@ UV_LEVELS = tl.constexpr(65535.0)
 MIN_DEPTH = tl.constexpr(1e-6)
 MIN_FOREGROUND_WEIGHT = tl.constexpr(0.99)
 WHOLLY_VISIBLE = tl.constexpr(0.99)
+FAR_APART = tl.constexpr(4.0)
+LEAST_WEIGHT = tl.constexpr(1e-6)
 GRID = tl.constexpr(32)  # pixels between the centers of two blocks of offsets
 
 
@@ -106,6 +108,70 @@ def warped(color, depth, around, first, right, down, live, WIDTH: tl.constexpr, 
 
 
 @triton.jit
+def texel_of(uv, flat, live, TEXTURE_WIDTH: tl.constexpr, TEXTURE_HEIGHT: tl.constexpr):
+    """Where pixels sample the texture, in texels; uv: rows [P,2] int16, `texture.encode_uv`."""
+    u = (tl.load(uv + flat * 2, mask=live, other=0).to(tl.float32) + 32768.0) / UV_LEVELS * TEXTURE_WIDTH
+    v = (tl.load(uv + flat * 2 + 1, mask=live, other=0).to(tl.float32) + 32768.0) / UV_LEVELS * TEXTURE_HEIGHT
+    return u, v
+
+
+@triton.jit
+def step_to_next(
+    uv,
+    depth,
+    flat,
+    distance,
+    u,
+    v,
+    inside_before,
+    inside_after,
+    NEXT: tl.constexpr,
+    TEXTURE_WIDTH: tl.constexpr,
+    TEXTURE_HEIGHT: tl.constexpr,
+):
+    """How far apart is what a pixel and the next along an axis show, u and v in texels; `texture._steps`.
+
+    NEXT: pixels from one to the next. inside_before, inside_after: [BLOCK] bool, whether the crop has it.
+    """
+    before = inside_before & (tl.load(depth + flat - NEXT, mask=inside_before, other=0.0) > 0) & (distance > 0)
+    after = inside_after & (tl.load(depth + flat + NEXT, mask=inside_after, other=0.0) > 0) & (distance > 0)
+    u_before, v_before = texel_of(uv, flat - NEXT, before, TEXTURE_WIDTH, TEXTURE_HEIGHT)
+    u_after, v_after = texel_of(uv, flat + NEXT, after, TEXTURE_WIDTH, TEXTURE_HEIGHT)
+    u_before, v_before, u_after, v_after = u - u_before, v - v_before, u_after - u, v_after - v
+    far = float("inf")
+    length_before = tl.maximum(tl.abs(u_before), tl.abs(v_before))
+    length_before = tl.where(before & (length_before <= FAR_APART), length_before, far)
+    length_after = tl.maximum(tl.abs(u_after), tl.abs(v_after))
+    length_after = tl.where(after & (length_after <= FAR_APART), length_after, far)
+    nearer = length_before < length_after
+    same = tl.minimum(length_before, length_after) < far
+    step_u = tl.where(same, tl.where(nearer, u_before, u_after), 0.0)
+    step_v = tl.where(same, tl.where(nearer, v_before, v_after), 0.0)
+    return step_u, step_v
+
+
+@triton.jit
+def inner(right, down):
+    """Quarters of both steps, [BLOCK] texels, so that the samples lie within two texels."""
+    right, down = right / 4, down / 4
+    share = 0.5 / tl.maximum(tl.abs(right) + tl.abs(down), 0.5)
+    return right * share, down * share
+
+
+@triton.jit
+def share_of(middle, first, right, down, highest, SAMPLE: tl.constexpr, CELL: tl.constexpr):
+    """What cell CELL (0 to 2) after the first has of sample SAMPLE (0 to 3) around the middle, along one axis."""
+    place = clamp(middle + (right if SAMPLE % 2 else -right) + (down if SAMPLE // 2 else -down), highest) - first
+    before, after = tl.maximum(1 - place, 0.0), tl.maximum(place - 1, 0.0)
+    if CELL == 0:
+        return before
+    elif CELL == 2:
+        return after
+    else:
+        return 1 - before - after
+
+
+@triton.jit
 def draw(
     chosen,
     relative,
@@ -121,6 +187,7 @@ def draw(
     slots,
     weights,
     tolerance,
+    AREAS: tl.constexpr,
     WIDTH: tl.constexpr,
     HEIGHT: tl.constexpr,
     CROP: tl.constexpr,
@@ -137,7 +204,7 @@ def draw(
     slot_map: [TEXTURE_HEIGHT,TEXTURE_WIDTH] int32, rows of the compact texture, -1 = none.
     Written, of the crop's PIXELS: condition and real [P,3] float32 in [-1,1], the source and the auxiliary view warped
     into it; foreground and visible [P,1] float32, 0 or 1; slots [P,4] int32 and weights [P,4] float32, where the source
-    samples the texture, weight 0 for background.
+    samples the texture, weight 0 for background; [P,9] with AREAS.
     tolerance: theta_z, metres. WIDTH, HEIGHT: of the views. CROP: the crop's width.
     """
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -185,30 +252,60 @@ def draw(
         value = tl.load(color + flat * 3 + channel, mask=live, other=0).to(tl.float32)
         tl.store(condition + pixel * 3 + channel, value / 127.5 - 1, mask=live)
 
-    u = (tl.load(uv + flat * 2, mask=live, other=0).to(tl.float32) + 32768.0) / UV_LEVELS * TEXTURE_WIDTH
-    v = (tl.load(uv + flat * 2 + 1, mask=live, other=0).to(tl.float32) + 32768.0) / UV_LEVELS * TEXTURE_HEIGHT
-    first, right, down = corner(u - 0.5, v - 0.5, TEXTURE_WIDTH, TEXTURE_HEIGHT)
-    for tap in tl.static_range(4):
-        slot = tl.load(slot_map + first + (tap // 2) * TEXTURE_WIDTH + tap % 2, mask=live, other=0)
-        weight = (right if tap % 2 else 1 - right) * (down if tap // 2 else 1 - down)
-        tl.store(slots + pixel * 4 + tap, tl.maximum(slot, 0), mask=live)
-        tl.store(weights + pixel * 4 + tap, tl.where(distance > 0, weight, 0.0), mask=live)
+    u, v = texel_of(uv, flat, live, TEXTURE_WIDTH, TEXTURE_HEIGHT)
+    if AREAS:
+        left, last = pixel % CROP > 0, pixel % CROP == CROP - 1
+        right_u, right_v = step_to_next(
+            uv, depth, flat, distance, u, v, live & left, live & ~last, 1, TEXTURE_WIDTH, TEXTURE_HEIGHT
+        )
+        above, below = live & (pixel >= CROP), pixel < PIXELS - CROP
+        down_u, down_v = step_to_next(
+            uv, depth, flat, distance, u, v, above, below, WIDTH, TEXTURE_WIDTH, TEXTURE_HEIGHT
+        )
+        right_u, down_u = inner(right_u, down_u)
+        right_v, down_v = inner(right_v, down_v)
+        u, v = u - 0.5, v - 0.5
+        most_u, most_v = TEXTURE_WIDTH - 1.0, TEXTURE_HEIGHT - 1.0
+        first_u = clamp(tl.floor(u - tl.abs(right_u) - tl.abs(down_u)), most_u - 2)
+        first_v = clamp(tl.floor(v - tl.abs(right_v) - tl.abs(down_v)), most_v - 2)
+        corner_of = slot_map + first_v.to(tl.int32) * TEXTURE_WIDTH + first_u.to(tl.int32)
+        total = tl.zeros_like(u)
+        for cell in tl.static_range(9):
+            slot = tl.load(corner_of + (cell // 3) * TEXTURE_WIDTH + cell % 3, mask=live, other=0)
+            weight = tl.zeros_like(u)
+            for one in tl.static_range(4):
+                across = share_of(u, first_u, right_u, down_u, most_u, one, cell % 3)
+                weight += across * share_of(v, first_v, right_v, down_v, most_v, one, cell // 3) / 4
+            weight = tl.where((distance > 0) & (slot >= 0), weight, 0.0)
+            total += weight
+            tl.store(slots + pixel * 9 + cell, tl.maximum(slot, 0), mask=live)
+            tl.store(weights + pixel * 9 + cell, weight, mask=live)
+        for cell in tl.static_range(9):
+            weight = tl.load(weights + pixel * 9 + cell, mask=live, other=0.0)
+            tl.store(weights + pixel * 9 + cell, weight / tl.maximum(total, LEAST_WEIGHT), mask=live)
+    else:
+        first, right, down = corner(u - 0.5, v - 0.5, TEXTURE_WIDTH, TEXTURE_HEIGHT)
+        for tap in tl.static_range(4):
+            slot = tl.load(slot_map + first + (tap // 2) * TEXTURE_WIDTH + tap % 2, mask=live, other=0)
+            weight = (right if tap % 2 else 1 - right) * (down if tap // 2 else 1 - down)
+            tl.store(slots + pixel * 4 + tap, tl.maximum(slot, 0), mask=live)
+            tl.store(weights + pixel * 4 + tap, tl.where(distance > 0, weight, 0.0), mask=live)
 
 
 @triton.jit
-def sample(values, slots, weights, rows, PIXELS: tl.constexpr, BLOCK: tl.constexpr):
-    """Four weighted texels for each pixel, `texture.sample_texels`.
+def sample(values, slots, weights, rows, PIXELS: tl.constexpr, TAPS: tl.constexpr, BLOCK: tl.constexpr):
+    """Some weighted texels for each pixel, `texture.sample_texels`.
 
-    values: [N,3] float32, the compact texture. slots: [P,4] int32 or int64, its rows. weights: [P,4] float32.
+    values: [N,3] float32, the compact texture. slots: [P,TAPS] int32 or int64, its rows. weights: [P,TAPS] float32.
     rows: [P,3] float32, written.
     """
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = pixel < PIXELS
     red = tl.zeros((BLOCK,), tl.float32)
     green, blue = red, red
-    for tap in tl.static_range(4):
-        weight = tl.load(weights + pixel * 4 + tap, mask=live, other=0.0)
-        texel = values + tl.load(slots + pixel * 4 + tap, mask=live, other=0).to(tl.int64) * 3
+    for tap in tl.static_range(TAPS):
+        weight = tl.load(weights + pixel * TAPS + tap, mask=live, other=0.0)
+        texel = values + tl.load(slots + pixel * TAPS + tap, mask=live, other=0).to(tl.int64) * 3
         red += weight * tl.load(texel, mask=live, other=0.0)
         green += weight * tl.load(texel + 1, mask=live, other=0.0)
         blue += weight * tl.load(texel + 2, mask=live, other=0.0)
@@ -218,16 +315,16 @@ def sample(values, slots, weights, rows, PIXELS: tl.constexpr, BLOCK: tl.constex
 
 
 @triton.jit
-def sample_backward(gradient, slots, weights, into, PIXELS: tl.constexpr, BLOCK: tl.constexpr):
+def sample_backward(gradient, slots, weights, into, PIXELS: tl.constexpr, TAPS: tl.constexpr, BLOCK: tl.constexpr):
     """Adds the gradient of `sample`'s rows to that of its values; no weight, no cost.
 
-    gradient: [P,3] float32. slots: [P,4] int32 or int64. weights: [P,4] float32. into: [N,3] float32, added to.
+    gradient: [P,3] float32. slots: [P,TAPS] int32 or int64. weights: [P,TAPS] float32. into: [N,3] float32, added to.
     """
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = pixel < PIXELS
-    for tap in tl.static_range(4):
-        weight = tl.load(weights + pixel * 4 + tap, mask=live, other=0.0)
-        texel = into + tl.load(slots + pixel * 4 + tap, mask=live, other=0).to(tl.int64) * 3
+    for tap in tl.static_range(TAPS):
+        weight = tl.load(weights + pixel * TAPS + tap, mask=live, other=0.0)
+        texel = into + tl.load(slots + pixel * TAPS + tap, mask=live, other=0).to(tl.int64) * 3
         for channel in tl.static_range(3):
             value = tl.load(gradient + pixel * 3 + channel, mask=live, other=0.0)
             tl.atomic_add(texel + channel, weight * value, mask=live & (weight != 0), sem="relaxed")

@@ -118,7 +118,7 @@ class AdversarialOptimizer:
         dtype = torch.bfloat16 if on_gpu and self.bfloat16 else torch.float32
         self.form = InputForm(8 if on_gpu else 6, dtype, preset.condition)
         perturbation = preset.perturbation * maps.width
-        self.sampler = PairSampler(maps, pairs, kind, self.crop, generator, perturbation)
+        self.sampler = PairSampler(maps, pairs, kind, self.crop, generator, perturbation, areas=preset.areas)
         self._filters = gabor_filters(device)
         weights = (1.0, preset.feature_weight, preset.gabor_weight)
         self._one, self._feature_weight, self._gabor_weight = (torch.tensor(w, device=device) for w in weights)

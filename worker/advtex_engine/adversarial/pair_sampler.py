@@ -14,13 +14,13 @@ from torch import Tensor
 
 from advtex_engine.render.pairs import Pairs
 from advtex_engine.render.reproject import reproject, unproject_pixels
-from advtex_engine.render.texture import bilinear_footprint, decode_uv
+from advtex_engine.render.texture import footprints
 from advtex_engine.render.view_maps import DEPTH_TOLERANCE, ViewMaps
 
 
 @dataclass(frozen=True)
 class DrawnPair:
-    """One pair, cropped to h x w: images [1,3,h,w] in [-1,1], masks [1,1,h,w] float 0/1, footprints [h*w,4]."""
+    """One pair, cropped to h x w: images [1,3,h,w] in [-1,1], masks [1,1,h,w] float 0/1, `footprints` [h*w,K]."""
 
     condition: Tensor
     real: Tensor
@@ -46,7 +46,8 @@ class PairSampler:
 
     kind: "object" or "scene", for theta_z. crop: width and height in pixels. generator: on the maps' device; its state
     is all that decides the draws to come. perturbation: pixels by which a turn and a move of the auxiliary camera
-    shift its image at most, each; from such virtual cameras few views give many examples (paper, supplement D).
+    shift its image at most, each; from such virtual cameras few views give many examples (paper, supplement D). areas:
+    whether a pixel shows the mean over its area or the value at its middle.
     """
 
     def __init__(
@@ -57,17 +58,17 @@ class PairSampler:
         crop: tuple[int, int],
         generator: torch.Generator,
         perturbation: float = 0.0,
+        *,
+        areas: bool = False,
     ) -> None:
         assert crop[0] <= maps.width and crop[1] <= maps.height
         self.maps, self.pairs, self.crop, self.generator = maps, pairs, crop, generator
-        self.perturbation = perturbation
+        self.perturbation, self.areas = perturbation, areas
         self.device = maps.color.device
         self.tolerance = DEPTH_TOLERANCE[kind]
         rows, columns = torch.arange(crop[1], device=self.device), torch.arange(crop[0], device=self.device)
         self._window = (rows[:, None] * maps.width + columns).flatten()
         self._window_xy = torch.stack((columns.repeat(len(rows)), rows.repeat_interleave(len(columns))), 1) + 0.5
-        self._texture_size = torch.tensor(maps.slot_map.shape[::-1], dtype=torch.float32, device=self.device)
-        self._slot_map = maps.slot_map.flatten()
         # On the device, so that maps and pairs may be refilled in place under a captured step.
         self.source_count = torch.tensor([pairs.sources.shape[0]], device=self.device)
 
@@ -82,17 +83,16 @@ class PairSampler:
         relative = self.relative(chosen, depth)
         real, visible = reproject(points, relative, maps, chosen.auxiliary[0], self.tolerance)
         visible = visible & foreground
-        uv = decode_uv(maps.uv.view(-1, 2).index_select(0, flat))
-        texels, weights = bilinear_footprint(uv * self._texture_size, maps.slot_map.shape[1], maps.slot_map.shape[0])
-        # A background pixel has uv 0; its weight is 0, so any row may stand for the texel that nobody owns.
-        slots = self._slot_map.index_select(0, texels.flatten()).view(texels.shape).clamp(min=0)
+        window = (self.crop[1], self.crop[0])
+        uv = maps.uv.view(-1, 2).index_select(0, flat)
+        slots, weights = footprints(uv.view(*window, 2), foreground.view(window), maps.slot_map, areas=self.areas)
         return DrawnPair(
             condition=self.image(maps.color.view(-1, 3).index_select(0, flat).to(torch.float32) / 127.5 - 1),
             real=self.image(real / 127.5 - 1),
             foreground=self.image(foreground.to(torch.float32)[:, None]),
             visible=self.image(visible.to(torch.float32)[:, None]),
             slots=slots,
-            weights=weights * foreground[:, None],
+            weights=weights,
         )
 
     def choose(self) -> Choice:

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from advtex_engine.adversarial.unlikeness import Unlikeness
 from advtex_engine.core.scene import evenly_spread
-from advtex_engine.render.texture import bilinear_footprint, decode_uv, sample_texels
+from advtex_engine.render.texture import footprints, sample_texels
 from advtex_engine.render.view_maps import ViewMaps
 
 PARTS = 5
@@ -77,7 +77,7 @@ class Turns:
 
 @dataclass(frozen=True)
 class _Cells:
-    """N cells of a left-out view: photograph [N,3,h,w] in [0,1], judged [N,h,w] bool, footprints [N*h*w,4]."""
+    """N cells of a left-out view: photograph [N,3,h,w] in [0,1], judged [N,h,w] bool, `footprints` [N*h*w,K]."""
 
     photograph: Tensor
     judged: Tensor
@@ -89,12 +89,12 @@ class LeftOutCells:
     """Cells of views, and how unlike a texture is to them.
 
     maps: of all views, wherever their pixels are. painted: [H,W] int16 of the start's own size, the view that each
-    texel was painted from, -1 = none.
+    texel was painted from, -1 = none. areas: as of the `PairSampler`.
     """
 
-    def __init__(self, maps: ViewMaps, painted: Tensor, unlikeness: Unlikeness) -> None:
-        self.maps, self.unlikeness = maps, unlikeness
-        self._painted = _resized(painted.to(maps.device), maps.slot_map.shape).flatten()
+    def __init__(self, maps: ViewMaps, painted: Tensor, unlikeness: Unlikeness, *, areas: bool = False) -> None:
+        self.maps, self.unlikeness, self.areas = maps, unlikeness, areas
+        self._painted = _resized(painted.to(maps.device), maps.slot_map.shape)[maps.slot_map >= 0]
         self.width, self.height = min(CELL, maps.width), min(CELL, maps.height)
         rows, columns = (torch.arange(side, device=maps.device) for side in (self.height, self.width))
         self._window = (rows[:, None] * maps.width + columns).flatten()
@@ -126,11 +126,11 @@ class LeftOutCells:
 
     def _cells(self, view: int, most: int) -> _Cells:
         maps = self.maps.only(view)
-        height, width = maps.slot_map.shape
-        size = torch.tensor([width, height], dtype=torch.float32, device=maps.device)
-        texels, weights = bilinear_footprint(decode_uv(maps.uv[0]) * size, width, height)
-        source = self._painted[texels]
-        judged = (maps.depth[0] > 0) & ((source >= 0) & (source != view)).all(1)
+        seen = maps.depth[0] > 0
+        picture = (maps.height, maps.width)
+        slots, weights = footprints(maps.uv[0].view(*picture, 2), seen.view(picture), maps.slot_map, areas=self.areas)
+        source = self._painted[slots]
+        judged = seen & ((weights == 0) | (source >= 0) & (source != view)).all(1)
         pixels = self._corners[:, None] + self._window
         counts = judged[pixels].sum(1)
         chosen = counts.argsort(descending=True, stable=True)[:most]
@@ -141,7 +141,7 @@ class LeftOutCells:
         return _Cells(
             color.view(*shape, 3).permute(0, 3, 1, 2).contiguous(),
             judged[flat].view(shape),
-            maps.slot_map.flatten()[texels[flat]].clamp(min=0),
+            slots[flat],
             weights[flat],
         )
 

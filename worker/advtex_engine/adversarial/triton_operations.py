@@ -18,11 +18,13 @@ from advtex_engine.adversarial.pair_sampler import Choice, DrawnPair, PairSample
 from advtex_engine.adversarial.triton_gabor import gabor_loss
 from advtex_engine.adversarial.triton_losses import judge, l1_loss, mean_difference
 from advtex_engine.adversarial.triton_offsets import example_offsets
+from advtex_engine.render.texture import FAR_APART, LEAST_WEIGHT
 
 BLOCK = 256  # pixels of a program
 LONG_BLOCK = 4096  # values of a program that only copies
 
 assert kernels.GRID.value == OFFSET_BLOCK // 2
+assert (kernels.FAR_APART.value, kernels.LEAST_WEIGHT.value) == (FAR_APART, LEAST_WEIGHT)
 
 
 def triton_operations() -> Operations:
@@ -54,12 +56,14 @@ def draw(sampler: PairSampler) -> DrawnPair:
     pixels = width * height
     condition, real = (torch.empty((pixels, 3), device=maps.color.device) for _ in range(2))
     foreground, visible = (torch.empty((pixels, 1), device=maps.color.device) for _ in range(2))
-    slots = torch.empty((pixels, 4), dtype=torch.int32, device=maps.color.device)
-    weights = torch.empty((pixels, 4), device=maps.color.device)
+    taps = 9 if sampler.areas else 4
+    slots = torch.empty((pixels, taps), dtype=torch.int32, device=maps.color.device)
+    weights = torch.empty((pixels, taps), device=maps.color.device)
     kernels.draw[_programs(pixels)](
         *(chosen, relative, maps.color, maps.uv, maps.depth, maps.intrinsics, maps.slot_map),
         *(condition, real, foreground, visible, slots, weights),
         sampler.tolerance,
+        AREAS=sampler.areas,
         WIDTH=maps.width,
         HEIGHT=maps.height,
         CROP=width,
@@ -92,7 +96,8 @@ class _SampleTexels(torch.autograd.Function):
         ctx.save_for_backward(slots, weights)
         ctx.rows = values.shape[0]
         rows = torch.empty((slots.shape[0], 3), device=values.device)
-        kernels.sample[_programs(len(rows))](values, slots, weights, rows, PIXELS=len(rows), BLOCK=BLOCK)
+        sizes = {"PIXELS": len(rows), "TAPS": slots.shape[1], "BLOCK": BLOCK}
+        kernels.sample[_programs(len(rows))](values, slots, weights, rows, **sizes)
         return rows
 
     @staticmethod
@@ -101,13 +106,14 @@ class _SampleTexels(torch.autograd.Function):
         gradient = grads[0].contiguous()
         into = torch.zeros((ctx.rows, 3), device=gradient.device)
         pixels = gradient.shape[0]
-        kernels.sample_backward[_programs(pixels)](gradient, slots, weights, into, PIXELS=pixels, BLOCK=BLOCK)
+        sizes = {"PIXELS": pixels, "TAPS": slots.shape[1], "BLOCK": BLOCK}
+        kernels.sample_backward[_programs(pixels)](gradient, slots, weights, into, **sizes)
         return into, None, None
 
 
 def sample_texels(values: Tensor, slots: Tensor, weights: Tensor) -> Tensor:
     """`texture.sample_texels` for three channels; the gradient's sums come in any order, so their rounding differs."""
-    assert values.shape[1:] == (3,) and slots.shape == weights.shape and slots.shape[1] == 4
+    assert values.shape[1:] == (3,) and slots.shape == weights.shape
     out: Tensor = _SampleTexels.apply(values, slots, weights)  # type: ignore[no-untyped-call]
     return out
 

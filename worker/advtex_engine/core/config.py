@@ -51,6 +51,8 @@ class Preset:
     alignment         both examples are moved onto the source image before they are judged (Zhao et al. 2022)
     perturbation      of the view's width, by which virtual motions of the auxiliary camera shift its image at most
                       (paper: 0; its supplement D proposes them for sparse views)
+    areas             the render's pixels are means over what they show, where the photographs' are; else values at
+                      their middles (paper; released code)
     max_crop          largest crop (width, height) in pixels; larger views are seen in parts, for cheaper steps
     max_pair_angle    largest angle between the optical axes of a pair, degrees (released code: 15)
     min_pair_overlap  least share of the source's foreground that the auxiliary view sees
@@ -82,6 +84,7 @@ class Preset:
     averaging: int = 0
     alignment: bool = False
     perturbation: float = 0.0
+    areas: bool = False
     max_crop: tuple[int, int] | None = None
     max_pair_angle: float = 15.0
     min_pair_overlap: float = 0.3
@@ -146,6 +149,7 @@ STANDARD = Preset(
     averaging=500,
     turn=30,
     alignment=True,
+    areas=True,
     max_crop=(384, 288),
 )
 PRESETS: dict[str, Preset] = {

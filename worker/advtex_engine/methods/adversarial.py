@@ -25,6 +25,7 @@ from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.methods.mean import dense_texture
 from advtex_engine.metrics.evaluate import configured_lpips
 from advtex_engine.render.pairs import Pairs, own_pairs, related_pairs
+from advtex_engine.render.sharpness import shows_areas
 from advtex_engine.render.streaming import PairViews, pair_views
 from advtex_engine.render.view_maps import ViewMaps
 from advtex_engine.runtime.checkpoint import Checkpoints
@@ -114,7 +115,7 @@ def _optimized(
             views.maps,
             views.pairs,
             _resized(texture, maps.slot_map.shape)[maps.slot_map >= 0],
-            rated(preset, maps, start),
+            fitted(preset, maps, start),
             kind=given.scene.kind,
             steps=preset.steps,
             generator=generator,
@@ -169,7 +170,7 @@ def _probes(
         optimizer.sampler.source_count.fill_(views.leave_out(left_out))
 
     probes = Probes(
-        LeftOutCells(maps, given.painted, unlikeness),
+        LeftOutCells(maps, given.painted, unlikeness, areas=optimizer.preset.areas),
         pairs.sources.tolist(),
         leave_out,
         judged_by="structure" if lpips is None else "LPIPS",
@@ -192,8 +193,9 @@ def adversarial_no_condition(given: MethodInput) -> tuple[Tensor, list[LossPoint
     return adversarial(replace(given, preset=replace(given.preset, condition=False)))
 
 
-def rated(preset: Preset, maps: ViewMaps, start: Tensor) -> Preset:
-    """The preset with the texture's rate in colors; start: dense [H,W,3] in [0,1]."""
+def fitted(preset: Preset, maps: ViewMaps, start: Tensor) -> Preset:
+    """The preset for these views: its rate in colors, areas where photographs show them. start: [H,W,3] in [0,1]."""
+    preset = replace(preset, areas=preset.areas and shows_areas(maps))
     if preset.lr_unit == "color":
         return preset
     return replace(preset, lr_texture=preset.lr_texture * disagreement(maps, start) ** 0.5, lr_unit="color")

@@ -3,10 +3,9 @@
 Each step compares a view's photograph with the texture's render by Gabor energies (`adversarial/gabor.py`), which
 forgive some pixels, so that every view adds to a texture that begins as a patchwork of single ones. Energies say
 nothing of colors, and nothing of what is wider than their coarsest octave: there means over blocks are compared, which
-some pixels of displacement hardly change either. The render's pixels are means over what they show, as a photograph's
-are: values at their middles would make a texture that is as soft as these means, and softer still when it is shown. Not
-where the start is sharper than the photographs are, which have been blurred by more than their pixels: there it would
-learn their grain.
+some pixels of displacement hardly change either. The render's pixels are means over what they show, where a
+photograph's are: values at their middles would make a texture that is as soft as these means, and softer still when it
+is shown.
 """
 
 from __future__ import annotations
@@ -17,20 +16,17 @@ from torch import Tensor
 
 from advtex_engine.adversarial.gabor import gabor_filters, gabor_loss
 from advtex_engine.adversarial.optimizer import crop_size
-from advtex_engine.core.scene import evenly_spread
 from advtex_engine.methods.descent import descend, drawn_views
 from advtex_engine.methods.inputs import LossPoint, MethodInput
-from advtex_engine.render.texture import area_footprint, bilinear_footprint, decode_uv, sample_texels
-from advtex_engine.render.view_maps import ViewMaps, foregrounds
+from advtex_engine.render.sharpness import shows_areas
+from advtex_engine.render.texture import footprints, sample_texels
+from advtex_engine.render.view_maps import ViewMaps
 
 PASSES = 5  # over all views, unless the number of steps is asked for
 REACH = 1e-2
 """Rate of the first step times the passes, in colors of [0, 1]: how far texels may go. Further on they fit photographs
 that are blurred, whatever the rate is, and edges soften; more steps take smaller ones."""
 MAX_LR = 2e-3  # larger steps leave grain
-SHARP_ENOUGH = 1.05  # gradients of the start, as a share of the photographs'
-SHARPNESS_VIEWS = 12
-LEAST_WEIGHT = 1e-6  # of a pixel's texels; some are owned where a view shows the surface
 BLOCK = 8  # pixels a side, of which means are compared; every half of it
 
 
@@ -47,14 +43,12 @@ def gabor(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     margins = torch.tensor([maps.width - width + 1, maps.height - height + 1])
     corners = (torch.rand((len(order), 2), generator=generator) * margins).long().tolist()
     filters = gabor_filters(device)
-    size = torch.tensor(maps.slot_map.shape[::-1], dtype=torch.float32, device=device)
 
-    start = given.means[1] if given.start is None else given.start
-    areas = sharpness(start, maps) < SHARP_ENOUGH
+    areas = shows_areas(maps)
 
     def unlikeness(values: Tensor, step: int) -> Tensor:
         photograph, foreground, slots, weights = _seen(
-            maps.only(order[step]), corners[step], (width, height), size, areas=areas
+            maps.only(order[step]), corners[step], (width, height), areas=areas
         )
         render = sample_texels(values, slots, weights).view(1, height, width, 3).permute(0, 3, 1, 2) * 2 - 1
         return gabor_loss(render, photograph, foreground, filters) + wide_loss(render, photograph, foreground)
@@ -72,24 +66,8 @@ def wide_loss(render: Tensor, photograph: Tensor, foreground: Tensor) -> Tensor:
     return F.avg_pool2d(difference, BLOCK, BLOCK // 2).abs().mean()
 
 
-def sharpness(texture: Tensor, maps: ViewMaps) -> float:
-    """Gradients of the texture's renders, of means over pixels, as a share of those of the photographs; [H,W,3]."""
-    values = texture[maps.slot_map >= 0]
-    size = torch.tensor(maps.slot_map.shape[::-1], dtype=torch.float32, device=maps.device)
-    sums = torch.zeros(2, device=maps.device)
-    for number in evenly_spread(foregrounds(maps).nonzero().flatten().tolist(), SHARPNESS_VIEWS):
-        photograph, foreground, slots, weights = _seen(
-            maps.only(number), [0, 0], (maps.width, maps.height), size, areas=True
-        )
-        render = sample_texels(values, slots, weights).view(1, maps.height, maps.width, 3).permute(0, 3, 1, 2) * 2 - 1
-        for axis in (2, 3):
-            both = -F.max_pool2d(-foreground.float(), (2, 1) if axis == 2 else (1, 2), 1)
-            sums += torch.stack([(image.diff(dim=axis).abs() * both).sum() for image in (render, photograph)])
-    return float(sums[0] / sums[1].clamp(min=1e-12))
-
-
 def _seen(
-    view: ViewMaps, corner: list[int], crop: tuple[int, int], size: Tensor, *, areas: bool
+    view: ViewMaps, corner: list[int], crop: tuple[int, int], *, areas: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """A crop of one view: photograph [1,3,h,w] in [-1,1], foreground [1,1,h,w], slots and weights [h*w,9] of what its
     pixels show, or [h*w,4] of what their middles do."""
@@ -97,14 +75,6 @@ def _seen(
     window = (slice(top, top + height), slice(left, left + width))
     color, uv = (part.view(view.height, view.width, -1)[window] for part in (view.color, view.uv))
     foreground = view.depth.view(view.height, view.width)[window] > 0
-    position, shape = decode_uv(uv) * size, view.slot_map.shape[::-1]
-    if areas:
-        texels, weights = area_footprint(position, foreground, *shape)
-    else:
-        texels, weights = bilinear_footprint(position.view(-1, 2), *shape)
-    slots = view.slot_map.flatten().index_select(0, texels.flatten()).view(texels.shape)
-    # Texels that nobody owns lie beyond a chart's border.
-    weights = weights * ((slots >= 0) & foreground.reshape(-1, 1))
-    weights = weights / weights.sum(1, keepdim=True).clamp(min=LEAST_WEIGHT)
+    slots, weights = footprints(uv, foreground, view.slot_map, areas=areas)
     photograph = color.permute(2, 0, 1)[None].to(torch.float32) / 127.5 - 1
-    return photograph, foreground[None, None], slots.clamp(min=0), weights
+    return photograph, foreground[None, None], slots, weights

@@ -63,5 +63,5 @@ def select_views(given: MethodInput) -> Selection:
         for part, nothing in ((color, 0), (own, -1), (agreement, 0))
     )
     known = label >= 0
-    texture = fill_holes(back_project(color, label, maps), known)
+    texture = fill_holes(back_project(fill_holes(color, known), label, maps), known)
     return Selection(texture, known, label.to(torch.int16), confidence, assignment.view)

@@ -18,6 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 UV_LEVELS = 65535
+LEAST_WEIGHT = 1e-6  # of a pixel's owned texels; some are owned where a view shows the surface
 FAR_APART = 4.0  # texels between what neighboring pixels show, beyond which they show different charts
 
 
@@ -68,7 +69,8 @@ def area_footprint(xy: Tensor, seen: Tensor, width: int, height: int) -> tuple[T
     inner = 0.5 / (right.abs() + down.abs()).clamp(min=0.5)
     right, down = right * inner, down * inner
     middle = xy.view(-1, 2).T - 0.5
-    most = torch.tensor([[width - 1.0], [height - 1.0]], device=xy.device)
+    # Made on the device: steps that are captured as a graph copy nothing to it.
+    most = torch.cat([torch.full((1, 1), side - 1.0, device=xy.device) for side in (width, height)])
     first = (middle - right.abs() - down.abs()).floor().clamp(min=0).minimum(most - 2)
     samples = torch.stack((middle - right - down, middle + right - down, middle - right + down, middle + right + down))
     place = samples.clamp(min=0).minimum(most) - first  # of samples in the 3 x 3 cells, [4,2,h*w] in [0,2]
@@ -78,6 +80,28 @@ def area_footprint(xy: Tensor, seen: Tensor, width: int, height: int) -> tuple[T
     corner = first[1].long() * width + first[0].long()
     cells = torch.arange(3, device=xy.device)
     return corner[:, None] + (cells[:, None] * width + cells).flatten(), torch.stack(weights, 1)
+
+
+def footprints(uv: Tensor, seen: Tensor, slot_map: Tensor, *, areas: bool) -> tuple[Tensor, Tensor]:
+    """The owned texels that each pixel of a picture shows, and their weights, which make 1 where it is seen, else 0.
+
+    uv: [h,w,2] int16 of `encode_uv`; seen: [h,w] bool; slot_map: [H,W]. Returns slots and weights [h*w,K]: 9 of
+    `area_footprint` with areas, else the 4 of `bilinear_footprint` around the pixels' middles.
+    """
+    height, width = slot_map.shape
+    place = decode_uv(uv)
+    position = torch.stack((place[..., 0] * width, place[..., 1] * height), -1)
+    if areas:
+        texels, weights = area_footprint(position, seen, width, height)
+    else:
+        texels, weights = bilinear_footprint(position.view(-1, 2), width, height)
+    slots = slot_map.flatten().index_select(0, texels.flatten()).view(texels.shape)
+    # A pixel that is not seen has uv 0, so any row may stand for a texel that nobody owns.
+    weights = weights * seen.reshape(-1, 1)
+    if areas:  # reach beyond a chart's border, where nobody owns any
+        weights = weights * (slots >= 0)
+        weights = weights / weights.sum(1, keepdim=True).clamp(min=LEAST_WEIGHT)
+    return slots.clamp(min=0), weights
 
 
 def _steps(xy: Tensor, seen: Tensor, axis: int) -> Tensor:

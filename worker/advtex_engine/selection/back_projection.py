@@ -3,7 +3,8 @@
 A photograph is resampled twice on its way to the screen, into the texture and out of it; each time its finest detail
 fades. Iterative back-projection (Irani & Peleg 1991, "Improving resolution by image registration") renders the texture
 in the views that it was taken from, and gives back to the texels what the render lacks. Each texel is corrected by its
-own view alone, so views that are misaligned do not blur each other.
+own view alone, so views that are misaligned do not blur each other. The render's pixels are means over their areas, as
+a photograph's are.
 """
 
 from __future__ import annotations
@@ -12,10 +13,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advtex_engine.render.texture import bilinear_footprint, decode_uv
+from advtex_engine.render.sharpness import fineness, sharpness
+from advtex_engine.render.texture import area_footprint, decode_uv
 from advtex_engine.render.view_maps import ViewMaps
 
-ROUNDS = 2  # more of them gain little, and raise the photographs' noise
+ROUNDS, FINE_ROUNDS = 2, 8
+FINEST = 0.87
+"""Fineness from which the photographs' detail is worth all rounds; what blurred ones have beyond two is mostly grain."""
+SHARP_ENOUGH = 0.97
+"""Gradients of renders as a share of the photographs', from which it ends: the texture shows the sharpest photographs,
+so that it gets sharper than most of them."""
 DETAIL_REACH = 4  # pixels; differences that are wider come from leveling and are meant
 MIN_WEIGHT = 0.25  # pixels; a texel that hardly any pixel shows is corrected less
 
@@ -23,11 +30,15 @@ MIN_WEIGHT = 0.25  # pixels; a texel that hardly any pixel shows is corrected le
 def back_project(texture: Tensor, label: Tensor, maps: ViewMaps) -> Tensor:
     """The texture [H,W,3] float32 in [0,1] with the detail of the views at working size that it was taken from.
 
-    label: [H,W] int64 view that each texel shows, -1 = none: such texels stay as they are. Not differentiable.
+    texture: without holes. label: [H,W] int64 view that each texel shows, -1 = none: such texels stay as they are. Not
+    differentiable.
     """
     assert texture.shape[:2] == label.shape == maps.slot_map.shape
     values, labels = texture.reshape(-1, 3), label.flatten()
-    for _ in range(ROUNDS):
+    fine = fineness(maps) >= FINEST
+    for _ in range(FINE_ROUNDS if fine else ROUNDS):
+        if not fine and sharpness(values.view_as(texture), maps) >= SHARP_ENOUGH:
+            break
         lacking, weight = torch.zeros_like(values), torch.zeros_like(values[:, 0])
         for view in range(maps.count):
             texels, weights, detail = _lacking_detail(values, labels, maps.only(view), view)
@@ -38,12 +49,14 @@ def back_project(texture: Tensor, label: Tensor, maps: ViewMaps) -> Tensor:
 
 
 def _lacking_detail(values: Tensor, labels: Tensor, view: ViewMaps, number: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Footprints [P,4], weights [P,4] of the pixels that show texels of this view alone; what they lack, [P,3]."""
+    """Texels [P,9] and weights [P,9] of the pixels that show texels of this view alone; what they lack, [P,3]."""
     height, width = view.slot_map.shape
     position = decode_uv(view.uv[0]) * torch.tensor([width, height], dtype=torch.float32, device=values.device)
     column, row = position[:, 0].long().clamp(max=width - 1), position[:, 1].long().clamp(max=height - 1)
-    pixels = ((view.depth[0] > 0) & (labels[row * width + column] == number)).nonzero()[:, 0]
-    texels, weights = bilinear_footprint(position[pixels], width, height)
+    seen, picture = view.depth[0] > 0, (view.height, view.width)
+    pixels = (seen & (labels[row * width + column] == number)).nonzero()[:, 0]
+    texels, weights = area_footprint(position.view(*picture, 2), seen.view(picture), width, height)
+    texels, weights = texels[pixels], weights[pixels]
     own = ((labels[texels] == number) | (weights == 0)).all(1)
     pixels, texels, weights = pixels[own], texels[own], weights[own]
     lacking = view.color[0][pixels].to(torch.float32) / 255 - (values[texels] * weights[..., None]).sum(1)

@@ -1,0 +1,64 @@
+"""How sharp photographs are, by themselves and beside the renders of a texture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from advtex_engine.core.scene import evenly_spread
+from advtex_engine.render.texture import footprints, sample_texels
+from advtex_engine.render.view_maps import ViewMaps, foregrounds
+
+VIEWS = 12  # of which either is measured
+FINE = 0.7
+"""Fineness from which a pixel of the photographs is the mean of what lies before it, and no more. Rendered pictures
+have .9 to 1.1, photographs of half a sensor's size .74 to .82, at its full size .60 and .66."""
+
+
+def shows_areas(maps: ViewMaps) -> bool:
+    """Whether a pixel of the photographs is the mean over its area, so that a render's pixel should be: see `FINE`.
+
+    Photographs that a lens, motion or interpolation has blurred by more than that say nothing of what is as small as a
+    pixel; a texture whose renders were means would take their grain for it.
+    """
+    return fineness(maps) >= FINE
+
+
+def fineness(maps: ViewMaps) -> float:
+    """Second differences of the photographs as a share of the differences two pixels apart; white noise has 1.7."""
+    sums = torch.zeros(2, device=maps.device)
+    for photograph, seen, _ in _pictures(maps):
+        for axis in (0, 1):
+            step = photograph.diff(dim=axis)
+            count = step.shape[axis] - 1
+            before, after = step.narrow(axis, 0, count), step.narrow(axis, 1, count)
+            whole = seen.narrow(axis, 0, count) & seen.narrow(axis, 1, count) & seen.narrow(axis, 2, count)
+            sums += torch.stack([(part.abs() * whole[..., None]).sum() for part in (after - before, after + before)])
+    return float(sums[0] / sums[1].clamp(min=1e-12))
+
+
+def sharpness(texture: Tensor, maps: ViewMaps) -> float:
+    """Gradients of the texture's renders, of means over areas, as a share of the photographs'; [H,W,3] in [0,1]."""
+    values = texture[maps.slot_map >= 0]
+    sums = torch.zeros(2, device=maps.device)
+    for photograph, seen, uv in _pictures(maps):
+        slots, weights = footprints(uv, seen, maps.slot_map, areas=True)
+        render = sample_texels(values, slots, weights).view(photograph.shape)
+        for axis in (0, 1):
+            count = seen.shape[axis] - 1
+            both = seen.narrow(axis, 0, count) & seen.narrow(axis, 1, count)
+            sums += torch.stack(
+                [(image.diff(dim=axis).abs() * both[..., None]).sum() for image in (render, photograph)]
+            )
+    return float(sums[0] / sums[1].clamp(min=1e-12))
+
+
+def _pictures(maps: ViewMaps) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Of some views the photograph [h,w,3] in [0,1], where it shows the mesh [h,w] bool, and uv [h,w,2] int16."""
+    size = (maps.height, maps.width)
+    for number in evenly_spread(foregrounds(maps).nonzero().flatten().tolist(), VIEWS):
+        view = maps.only(number)
+        color = view.color.view(*size, 3).to(torch.float32) / 255
+        yield color, view.depth.view(size) > 0, view.uv.view(*size, 2)

@@ -76,13 +76,13 @@ def test_bfloat16_gives_the_same_quality_on_a_synthetic_scan(tmp_path: Path, mon
     seed on scans of this size."""
     for name in ("write_gallery", "write_page"):  # nobody looks at the pictures
         monkeypatch.setattr(pipeline, name, lambda *_: ())
-    synthesize(tmp_path / "scan", views=12, width=160, height=120)
+    synthesize(tmp_path / "scan", views=12, width=128, height=96)
     scores, textures = [], []
     for half in (False, True):
         for module in ("adversarial.optimizer", "stages.atlas"):
             monkeypatch.setattr(f"advtex_engine.{module}.native_bfloat16", lambda _, half=half: half)
         out = tmp_path / str(half)
-        config = TextureConfig(preset="standard", steps=90, holdout=4, device="cpu", refine=False, outputs="glb")
+        config = TextureConfig(preset="standard", steps=60, holdout=4, device="cpu", refine=False, outputs="glb")
         report = pipeline.texture_scan(tmp_path / "scan", out, config, work=out / "work").report
         assert report["step"]["precision"] == ("bf16" if half else "fp32")
         found = {name: value for name, value in report["heldout"]["texture"].items() if isinstance(value, float)}

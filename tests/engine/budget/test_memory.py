@@ -116,7 +116,7 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("scan") / "scan"
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("advtex_engine.synthetic.scan.HELDOUT_VIEWS", 1)  # nothing is scored against them
-        synthesize(path, views=16, width=640, height=480)
+        synthesize(path, views=16, width=480, height=360)
     return path
 
 

@@ -31,7 +31,8 @@ def test_with_wrong_cameras_it_beats_l1_in_patch_statistics_without_speckle(
     patches, speckled = {}, {}
     for method in ("l1", "view_selection", "adversarial"):
         steps = STEPS if method == "adversarial" else None
-        config = TextureConfig(preset="paper", method=method, steps=steps, face_budget=2_000, device="cpu")
+        few = {"face_budget": 2_000, "outputs": "glb", "device": "cpu"}
+        config = TextureConfig(preset="paper", method=method, steps=steps, **few)
         result = texture_scan(scan, tmp_path / method, config, work=tmp_path / "work")
         patches[method] = compare_to_truth(tmp_path / method / "model.obj", scan)["sliced_wasserstein"]
         speckled[method] = result.report["speckled_texels"]

@@ -19,7 +19,7 @@ from advtex_engine.render.view_maps import ViewMaps
 
 ROUNDS, FINE_ROUNDS = 2, 8
 FINEST = 0.87
-"""Fineness from which the photographs' detail is worth all rounds; what blurred ones have beyond two is mostly grain."""
+"""Fineness from which photographs are worth all rounds; what blurred ones have beyond two is mostly grain."""
 SHARP_ENOUGH = 0.97
 """Gradients of renders as a share of the photographs', from which it ends: the texture shows the sharpest photographs,
 so that it gets sharper than most of them."""

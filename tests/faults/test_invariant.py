@@ -18,7 +18,7 @@ from tiny_scan import write_zip
 
 from advtex_contract.jobs import TERMINAL
 
-JOBS = 40
+JOBS, JOBS_OF_SOAK = 24, 40
 OWNERS = ("ada", "bea", "cid")
 SECONDS = 240.0  # after the last fault
 
@@ -58,13 +58,13 @@ def test_a_disk_can_be_filled_here(small_disk: Path | None) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1])
 def test_everything_breaks_on_one_machine(tmp_path: Path, scan: Path, machine: Place, seed: int) -> None:
-    survive(tmp_path, scan, machine, seed, until_finished=0)
+    survive(tmp_path, scan, machine, seed, JOBS, until_finished=0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [2])
 def test_everything_breaks_in_a_fleet(tmp_path: Path, scan: Path, distributed: Place, seed: int) -> None:
-    survive(tmp_path, scan, distributed, seed, until_finished=0)
+    survive(tmp_path, scan, distributed, seed, JOBS, until_finished=0)
 
 
 @pytest.mark.slow
@@ -72,7 +72,7 @@ def test_everything_breaks_in_a_fleet(tmp_path: Path, scan: Path, distributed: P
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("seed", range(101, 111))
 def test_everything_breaks_on_one_machine_again(tmp_path: Path, scan: Path, machine: Place, seed: int) -> None:
-    survive(tmp_path, scan, machine, seed, until_finished=30)
+    survive(tmp_path, scan, machine, seed, JOBS_OF_SOAK, until_finished=30)
 
 
 @pytest.mark.slow
@@ -80,11 +80,11 @@ def test_everything_breaks_on_one_machine_again(tmp_path: Path, scan: Path, mach
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("seed", range(201, 211))
 def test_everything_breaks_in_a_fleet_again(tmp_path: Path, scan: Path, distributed: Place, seed: int) -> None:
-    survive(tmp_path, scan, distributed, seed, until_finished=30)
+    survive(tmp_path, scan, distributed, seed, JOBS_OF_SOAK, until_finished=30)
 
 
-def survive(folder: Path, scan: Path, place: Place, seed: int, *, until_finished: int) -> None:
-    """Faults come until all jobs are submitted, every kind of fault has come, and so many jobs have finished."""
+def survive(folder: Path, scan: Path, place: Place, seed: int, count: int, *, until_finished: int) -> None:
+    """Faults come until `count` jobs are submitted, every kind of fault has come, and so many jobs have finished."""
     archive = write_zip(folder / "scan.zip", scan).read_bytes()
     with fleet(folder, place, servers=2, workers=3, engine="journaled") as running:
         keys = {owner: running.store.accounts.create_key(owner, owner=owner) for owner in OWNERS}
@@ -92,8 +92,8 @@ def survive(folder: Path, scan: Path, place: Place, seed: int, *, until_finished
         began = time.monotonic()
         chaos.start()
         try:
-            jobs, canceled = submit_all(running, keys, archive, seed)
-            enough = JOBS - until_finished
+            jobs, canceled = submit_all(running, keys, archive, seed, count)
+            enough = count - until_finished
             wait_until(lambda: chaos.has_done_all and unfinished(running) <= enough, seconds=SECONDS)
         finally:
             chaos.stop()
@@ -103,7 +103,7 @@ def survive(folder: Path, scan: Path, place: Place, seed: int, *, until_finished
 
 
 def submit_all(
-    running: Fleet, keys: Mapping[str, str], archive: bytes, seed: int
+    running: Fleet, keys: Mapping[str, str], archive: bytes, seed: int, count: int
 ) -> tuple[dict[str, tuple[str, int, int]], set[str]]:
     """One upload and a third of the jobs per owner, at the same time. Some jobs are canceled on their way."""
     made: dict[str, tuple[str, int, int]] = {}
@@ -127,7 +127,7 @@ def submit_all(
             errors.append(error)
 
     threads = [
-        threading.Thread(target=submit, args=(owner, keys[owner], range(n, JOBS, len(OWNERS))))
+        threading.Thread(target=submit, args=(owner, keys[owner], range(n, count, len(OWNERS))))
         for n, owner in enumerate(OWNERS)
     ]
     for thread in threads:
@@ -136,7 +136,7 @@ def submit_all(
         thread.join()
     if errors:
         raise errors[0]
-    assert len(made) == JOBS
+    assert len(made) == count
     return made, canceled
 
 

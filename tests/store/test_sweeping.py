@@ -298,7 +298,7 @@ def test_sweeping_never_removes_what_a_row_refers_to(sqlite_bench: Any, data: st
 
 
 @pytest.mark.slow
-@settings(EXAMPLES, max_examples=15)
+@settings(EXAMPLES, max_examples=8)
 @given(data=st.data())
 def test_sweeping_a_bucket_spares_what_a_row_refers_to(
     sqlite_bench: Any, data: st.DataObject, s3_url: str, small_parts: None, tmp_path: Path

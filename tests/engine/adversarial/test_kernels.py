@@ -484,21 +484,20 @@ for name, types, off in variants:
     constants = {key: value for key, value in (SIZES | off).items() if key in kernel.arg_names}
     signature |= dict.fromkeys(constants, "constexpr")
     source = ASTSource(kernel, {key: signature[key] for key in kernel.arg_names}, constants)
-    compiled = triton.compile(source, target=GPUTarget("cuda", CAPABILITY, 32))
+    compiled = triton.compile(source, target=GPUTarget("cuda", 80, 32))
     assert compiled.asm["cubin"]
     print(name, compiled.metadata.num_warps)
 """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("capability", ["80", "90"])
-def test_the_kernels_compile_for_gpus_that_are_not_here(tmp_path: Path, capability: str) -> None:
-    """In a process of its own, in which they are not made for the interpreter."""
-    script = COMPILE.replace("CAPABILITY", capability)
+def test_the_kernels_compile_for_a_gpu_that_is_not_here(tmp_path: Path) -> None:
+    """For the first that has all they use, bfloat16; in a process of its own, in which they are not made for the
+    interpreter."""
     environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
     environment["TRITON_CACHE_DIR"] = str(tmp_path)
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=300, env=environment
+        [sys.executable, "-c", COMPILE], capture_output=True, text=True, check=False, timeout=300, env=environment
     )
     assert done.returncode == 0, done.stderr
     assert len(done.stdout.splitlines()) == 31

@@ -102,12 +102,13 @@ RUN = """
 import json, sys
 from pathlib import Path
 from advtex_engine.core.config import TextureConfig
-from advtex_engine.pipeline import texture_scan
+from advtex_engine import pipeline
 scan, folder, preset = sys.argv[1:]
 # What stands before the optimization is not counted, nor what comes after it: it is made as cheap as it may be.
 few = {"refine": False, "face_budget": 5000, "outputs": "glb"}
+pipeline.write_gallery = pipeline.write_page = lambda *_: ()
 config = TextureConfig(preset=preset, steps=8, device="cpu", **few)
-print(json.dumps(texture_scan(Path(scan), Path(folder), config, work=Path(folder) / "work").report["memory"]))
+print(json.dumps(pipeline.texture_scan(Path(scan), Path(folder), config, work=Path(folder) / "work").report["memory"]))
 """
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from advtex_engine.render.texture import bilinear_footprint, encode_uv, number_slots
 from advtex_engine.render.view_maps import ViewMaps
-from advtex_engine.selection.back_projection import back_project
+from advtex_engine.selection.back_projection import _window_sums, back_project
 
 SIDE = 60  # texels
 WIDTH, HEIGHT = 56, 50
@@ -84,3 +84,16 @@ def test_each_texel_hears_its_own_view_alone() -> None:
     assert torch.equal(clean[:, : SIDE // 2], spoiled[:, : SIDE // 2])
     assert not torch.equal(clean[:, SIDE // 2 :], spoiled[:, SIDE // 2 :])
     assert not torch.equal(clean[5:, : SIDE // 2], start[5:, : SIDE // 2])
+
+
+def test_windows_are_summed_as_a_pool_of_ones_does() -> None:
+    planes = torch.rand((3, 37, 52), generator=torch.Generator().manual_seed(4)) - 0.5
+    expected = 81 * F.avg_pool2d(planes, 9, 1, 4)
+    torch.testing.assert_close(_window_sums(planes, 4), expected, atol=1e-4, rtol=0)
+
+
+def test_a_view_that_shows_nothing_of_its_own_is_passed_over() -> None:
+    truth = noise()
+    maps, alone = maps_of([(2.3, 1.6), (2.4, 1.7)], truth), maps_of([(2.3, 1.6)], truth)
+    label = torch.zeros((SIDE, SIDE), dtype=torch.int64)
+    assert torch.equal(back_project(blurred(truth), label, maps), back_project(blurred(truth), label, alone))

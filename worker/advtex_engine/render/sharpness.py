@@ -12,9 +12,9 @@ from advtex_engine.render.texture import footprints, sample_texels
 from advtex_engine.render.view_maps import ViewMaps, foregrounds
 
 VIEWS = 12  # of which either is measured
-FINE = 0.7
+FINE = 0.68
 """Fineness from which a pixel of the photographs is the mean of what lies before it, and no more. Rendered pictures
-have .9 to 1.1, photographs of half a sensor's size .74 to .82, at its full size .60 and .66."""
+have .9 to 1.1, photographs of half a sensor's size .70 to .78, at its full size .60 and .66."""
 
 
 def shows_areas(maps: ViewMaps) -> bool:

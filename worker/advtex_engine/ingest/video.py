@@ -79,7 +79,9 @@ class _ArchiveFile(io.RawIOBase):
 
     def readinto(self, buffer: WriteableBuffer, /) -> int:
         view = memoryview(buffer).cast("B")
-        length = max(0, min(len(view), self._size - self._position))
+        length = min(len(view), self._size - self._position)
+        if length <= 0:  # a damaged file sends its reader beyond its end
+            return 0
         view[:length] = self._archive.read_range(self._path, self._position, length)
         self._position += length
         return length

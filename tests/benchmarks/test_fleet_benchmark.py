@@ -10,7 +10,8 @@ from harness import Results
 
 
 @pytest.mark.slow
-def test_a_tiny_fleet_is_measured(tmp_path: Path, postgres_server: str) -> None:
+def test_a_tiny_fleet_is_measured(tmp_path: Path, postgres_server: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fleet, "BEATING_PROCESSES", 1)
     results = Results(tmp_path / "fleet.json")
     for database, server in (("sqlite", None), ("postgresql", postgres_server)):
         for jobs in (40, 80):

@@ -283,7 +283,7 @@ def live_on(bench: Any, blobs: Interrupted, data: st.DataObject) -> None:
 
 
 EXAMPLES = settings(
-    max_examples=60,
+    max_examples=30,
     phases=[Phase.explicit, Phase.generate],
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large],
@@ -298,7 +298,7 @@ def test_sweeping_never_removes_what_a_row_refers_to(sqlite_bench: Any, data: st
 
 
 @pytest.mark.slow
-@settings(EXAMPLES, max_examples=8)
+@settings(EXAMPLES, max_examples=5)
 @given(data=st.data())
 def test_sweeping_a_bucket_spares_what_a_row_refers_to(
     sqlite_bench: Any, data: st.DataObject, s3_url: str, small_parts: None, tmp_path: Path

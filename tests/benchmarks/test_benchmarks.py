@@ -282,12 +282,12 @@ def test_each_part_is_switched_off_once(
     monkeypatch.setattr(parts, "SCAN_FACES", 600)
     some = (*parts.SHOWN, "view selection without a lens")
     monkeypatch.setattr(parts, "VARIANTS", {name: parts.VARIANTS[name] for name in some})
-    line = [str(small_desk), *SMALL, "--models", "1", "--lpips-weights", str(weights)]
+    line = [str(small_desk), *SMALL, "--synthetic", "geometry", "--models", "1", "--lpips-weights", str(weights)]
     line += ["--results", str(tmp_path)]
     parts.main(line)
     page = (tmp_path / "parts.md").read_text()
-    assert all(page.count(f"| {variant} |") == 3 for variant in parts.VARIANTS)
-    assert all((tmp_path / f"{scan}_0.png").stat().st_size > 1000 for scan in ("default", "geometry"))
+    assert all(page.count(f"| {variant} |") == 2 for variant in parts.VARIANTS)
+    assert (tmp_path / "geometry_0.png").stat().st_size > 1000
     assert (tmp_path / "desk" / "the_whole" / "sheet.png").stat().st_size > 1000
 
     monkeypatch.setattr(parts, "prepare", lambda *_: pytest.fail("every cell is there already"))

@@ -89,6 +89,9 @@ VARIANTS = {
     "view selection without back-projection": Variant(
         "view_selection", code={"advtex_engine.methods.view_selection.back_project": lambda color, *_: color}
     ),
+    "view selection without shared detail": Variant(
+        "view_selection", code={"advtex_engine.methods.view_selection.share_detail": lambda texture, *_: texture}
+    ),
     "view selection without exposures": Variant(
         "view_selection", prepared={f"{REFINE}.run.fit_exposure": _one_exposure}
     ),

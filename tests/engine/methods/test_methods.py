@@ -401,8 +401,32 @@ def test_gabor_takes_what_is_wide_from_all_photographs_and_keeps_detail(
     assert 0.95 < float(slope(texture) / slope(picture)) < 1.05
 
 
-def test_four_times_the_steps_of_gabor_end_near_where_the_steps_do(tmp_path: Path) -> None:
+@pytest.mark.parametrize("method", ["gabor", "adversarial"])
+def test_half_of_an_optimized_texture_s_finest_detail_is_what_photographs_share(
+    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = task(plane(), (view("0", plane(), truth(), camera((0.5, 0.45, 1.0))),), tmp_path)
+    start = given.means[1]
+    given = replace(given, config=TextureConfig(method=method, steps=3, preset="preview"), start=start)
+    given = replace(given, painted=torch.zeros(start.shape[:2], dtype=torch.int16))
+    asked: list[tuple[Tensor, float]] = []
+    monkeypatch.setattr(
+        importlib.import_module(f"advtex_engine.methods.{method}"),
+        "share_detail",
+        lambda texture, _, share: asked.append((texture, share)) or texture / 2,
+    )
+    texture, _ = texture_function(method)(replace(given, preset=replace(given.preset, turn=0)))
+    ((before, share),) = asked
+    assert share == 0.5
+    assert torch.equal(texture, before / 2)
+    assert not torch.equal(before, start)
+
+
+def test_four_times_the_steps_of_gabor_end_near_where_the_steps_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its photographs are sharper than the start: with the same rate the texture would go on moving."""
+    monkeypatch.setattr(gabor, "share_detail", lambda texture, *_: texture)  # what the steps do
     fine = torch.rand((1, 3, SIDE // 3, SIDE // 3), generator=torch.Generator().manual_seed(4))
     picture = F.interpolate(fine, (SIDE, SIDE), mode="bilinear")[0].permute(1, 2, 0)
     maps = planar_maps((picture * 255).round().to(torch.uint8).expand(5, -1, -1, -1).contiguous(), SIDE, SIDE)

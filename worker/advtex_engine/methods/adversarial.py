@@ -29,6 +29,7 @@ from advtex_engine.render.sharpness import shows_areas
 from advtex_engine.render.streaming import PairViews, pair_views
 from advtex_engine.render.view_maps import ViewMaps
 from advtex_engine.runtime.checkpoint import Checkpoints
+from advtex_engine.selection.shared_detail import OPTIMIZED, share_detail
 
 NEEDED = ("level", "step", "losses", "quality", "halved", "probed", "optimizer", "views", "probes")
 """What a checkpoint holds."""
@@ -56,6 +57,7 @@ class _Run:
 def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     """Optimizes the texture; goes on from the work folder's checkpoint when there is one.
 
+    From view selection, the finest detail is shared at the end (`share_detail`), unless the start is kept.
     Returns the dense texture [H,W,3] float32 in [0,1] and the loss history; what the discriminator knew is the fact
     "game", and a warning where that was no help to the texture. Raises Stopped, after a checkpoint, when
     the monitor asks for it. On a CPU the result does not depend on whether and where the run was interrupted. A run
@@ -141,6 +143,8 @@ def _optimized(
         run.level = number + 1
         if not helped:
             break
+    if given.painted is not None and texture is not start:
+        texture = share_detail(texture.clamp(0, 1), given.maps[1], OPTIMIZED)
     told = probed(run.probed, preset.steps)
     if told is not None:
         given.monitor.note(told["told"])

@@ -5,7 +5,7 @@ forgive some pixels, so that every view adds to a texture that begins as a patch
 nothing of colors, and nothing of what is wider than their coarsest octave: there means over blocks are compared, which
 some pixels of displacement hardly change either. The render's pixels are means over what they show, where a
 photograph's are: values at their middles would make a texture that is as soft as these means, and softer still when it
-is shown.
+is shown. At the end half of the finest detail is that of all photographs that agree (`selection/shared_detail.py`).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.render.sharpness import shows_areas
 from advtex_engine.render.texture import footprints, sample_texels
 from advtex_engine.render.view_maps import ViewMaps
+from advtex_engine.selection.shared_detail import OPTIMIZED, share_detail
 
 PASSES = 5  # over all views, unless the number of steps is asked for
 REACH = 1e-2
@@ -54,7 +55,9 @@ def gabor(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
         return gabor_loss(render, photograph, foreground, filters) + wide_loss(render, photograph, foreground)
 
     rate = min(MAX_LR, REACH * len(set(order)) / len(order))
-    return descend(given, "gabor", unlikeness, len(order), generator, rate=rate)
+    texture, losses = descend(given, "gabor", unlikeness, len(order), generator, rate=rate)
+    # Energies say how much detail there is, and not where.
+    return share_detail(texture, maps, OPTIMIZED), losses
 
 
 def wide_loss(render: Tensor, photograph: Tensor, foreground: Tensor) -> Tensor:

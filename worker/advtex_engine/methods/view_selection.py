@@ -1,4 +1,5 @@
-"""View selection: every face shows one photograph's detail (after Waechter et al. 2014, "Let There Be Color!")."""
+"""View selection: every face shows one photograph (after Waechter et al. 2014, "Let There Be Color!"), and what others
+have in common with it."""
 
 from __future__ import annotations
 
@@ -16,6 +17,7 @@ from advtex_engine.selection.candidates import OCCLUSION_SHARE, find_candidates
 from advtex_engine.selection.detail import blur_cost
 from advtex_engine.selection.leveling import Sampler, blend_texels
 from advtex_engine.selection.mrf import assign_views
+from advtex_engine.selection.shared_detail import share_detail
 from advtex_engine.selection.tones import shared_tones
 
 
@@ -43,7 +45,7 @@ def view_selection(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
 
 
 def select_views(given: MethodInput) -> Selection:
-    """One view per face, from the views at working size, leveled, with all their detail. Not differentiable."""
+    """One view per face, from the views at working size, leveled, with the detail they share. Not differentiable."""
     atlas, maps = given.atlas, given.maps[1]
     mesh = atlas.mesh
     # What is hidden by less than this counts as seen.
@@ -63,5 +65,5 @@ def select_views(given: MethodInput) -> Selection:
         for part, nothing in ((color, 0), (own, -1), (agreement, 0))
     )
     known = label >= 0
-    texture = fill_holes(back_project(fill_holes(color, known), label, maps), known)
+    texture = fill_holes(share_detail(back_project(fill_holes(color, known), label, maps), maps), known)
     return Selection(texture, known, label.to(torch.int16), confidence, assignment.view)

@@ -24,3 +24,12 @@ def separable(planes: Tensor, kernel: Tensor, border: str = "reflect") -> Tensor
     # Planes as channels of one image: as images of one channel they take a CPU five to eleven times as long.
     rows = F.conv2d(padded, kernel.expand(count, 1, 1, -1), groups=count)
     return F.conv2d(rows, kernel[:, None].expand(count, 1, -1, 1), groups=count)[0]
+
+
+def window_sums(planes: Tensor, reach: int) -> Tensor:
+    """Sums of [C,h,w] over the windows that reach so many pixels to each side, [C,h,w]; outside there is nothing."""
+    side = 2 * reach + 1
+    # From sums of all that lies before: as many additions whatever the window's size.
+    total = F.pad(planes, (reach + 1, reach, reach + 1, reach)).cumsum(1).cumsum(2)
+    rows = total[:, side:] - total[:, :-side]
+    return rows[:, :, side:] - rows[:, :, :-side]

@@ -15,6 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from advtex_engine.render.filtering import window_sums
 from advtex_engine.render.sharpness import fineness, sharpness
 from advtex_engine.render.texture import area_footprint, decode_uv, sample_texels
 from advtex_engine.render.view_maps import ViewMaps
@@ -96,14 +97,5 @@ def _lacking_detail(values: Tensor, texels: Tensor, own: _Own, view: ViewMaps) -
     sums = torch.zeros(((last - first + 1) * view.width, 4), device=values.device)
     inside = own.pixels - first * view.width
     sums[inside] = F.pad(lacking, (0, 1), value=1.0)
-    around = _window_sums(sums.T.contiguous().view(4, -1, view.width), DETAIL_REACH).view(4, -1)[:, inside]
+    around = window_sums(sums.T.contiguous().view(4, -1, view.width), DETAIL_REACH).view(4, -1)[:, inside]
     return lacking - (around[:3] / around[3]).T
-
-
-def _window_sums(planes: Tensor, reach: int) -> Tensor:
-    """Sums of [C,h,w] over the windows that reach so many pixels to each side, [C,h,w]; outside there is nothing."""
-    side = 2 * reach + 1
-    # From sums of all that lies before: as many additions whatever the window's size.
-    total = F.pad(planes, (reach + 1, reach, reach + 1, reach)).cumsum(1).cumsum(2)
-    rows = total[:, side:] - total[:, :-side]
-    return rows[:, :, side:] - rows[:, :, :-side]

@@ -1,0 +1,133 @@
+"""Fine detail of all photographs that agree with what is painted to a fraction of a pixel.
+
+Each place is painted from one photograph, with that photograph's grain and the traces of its resampling. What other
+photographs show of the same place is the same detail with other grain, a pixel or so beside it, as cameras and meshes
+are off. So each is first moved onto the texture's render by a smooth displacement (Lucas and Kanade 1981, coarse to
+fine), and then counts by how well its detail correlates with the render's: blurred, hidden, sheen or elsewhere, it
+counts as nothing, and a place that no other photograph agrees about keeps its one. Means of several photographs, as
+multi-frame super-resolution takes them (Irani and Peleg 1991), but of the finest band alone: what is wider, tones and
+leveling have decided.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from advtex_engine.render.filtering import window_sums
+from advtex_engine.render.texture import footprints, sample_texels
+from advtex_engine.render.view_maps import ViewMaps, foregrounds
+
+BAND = 2  # pixels to each side; what is wider than such a window is no detail
+WINDOW = 7  # pixels to each side, over which detail is correlated
+POWER = 8  # of the correlation: what agrees by three quarters counts a tenth
+OCTAVES, ROUNDS = 3, 2  # of the displacement: pictures of half the size each, and steps in each
+OPTIMIZED = 0.5
+"""Share of it for textures that were optimized: energies of all photographs are in these already, and photographs that
+are moved to be compared are softer."""
+REACH = 12  # pixels to each side, over which it is one
+SMOOTH = 6  # and over which the found ones are averaged: detail must not be bent to fit
+LEAST_SIDE = 16  # pixels; smaller pictures have no octave of their own
+FAINT = 1e-5
+"""Variance of detail, and square of slopes, that count as none; of colors in [0, 1]: three thousandths."""
+MIN_WEIGHT = 0.25  # pixels; a texel that hardly any pixel shows is corrected less
+INSIDE = 0.99  # share of a moved pixel that must lie where its photograph shows the mesh
+LUMA = (0.299, 0.587, 0.114)
+
+
+def share_detail(texture: Tensor, maps: ViewMaps, share: float = 1.0) -> Tensor:
+    """The texture [H,W,3] float32 in [0,1] with the finest detail that the views at working size have in common.
+
+    texture: without holes; texels that no view samples stay as they are. share: of the correction that is made; the
+    rest of the texture's own detail stays. Not differentiable.
+    """
+    assert texture.shape[:2] == maps.slot_map.shape
+    owned = maps.slot_map >= 0
+    values = texture[owned]
+    lacking, weight = torch.zeros_like(values), torch.zeros_like(values[:, 0])
+    for view in foregrounds(maps).nonzero().flatten().tolist():
+        slots, shares, detail = _agreed_detail(values, maps.only(view))
+        for channel in range(3):  # index_add_ of short rows takes three times as long on a CPU
+            lacking[:, channel].index_add_(0, slots, (detail[channel, :, None] * shares).flatten())
+        weight.index_add_(0, slots, shares.flatten())
+    values = (values + share * lacking / (weight + MIN_WEIGHT)[:, None]).clamp(0, 1)
+    return texture.masked_scatter(owned[..., None], values)
+
+
+def _agreed_detail(values: Tensor, view: ViewMaps) -> tuple[Tensor, Tensor, Tensor]:
+    """What the render lacks of a view's P pixels: slots [P*K], how much each counts there [P,K], detail [3,P]."""
+    size = (view.height, view.width)
+    seen = view.depth.view(size) > 0
+    slots, shares = footprints(view.uv.view(*size, 2), seen, view.slot_map, areas=True)
+    photograph = view.color.view(*size, 3).permute(2, 0, 1).to(torch.float32) / 255
+    render = sample_texels(values, slots, shares).view(*size, 3).permute(2, 0, 1)
+    render = torch.where(seen, render, photograph)
+    known = seen.to(torch.float32)
+    luma = values.new_tensor(LUMA)
+    ours, theirs = (torch.tensordot(luma, picture, 1) for picture in (render, photograph))
+    moved = displacement(ours, theirs, known)
+    photograph = _sampled(photograph, moved, "bicubic")
+    known = known * (_sampled(known[None], moved, "bilinear")[0] > INSIDE)
+    theirs = torch.tensordot(luma, photograph, 1)
+    detail = _band(torch.cat((photograph - render, ours[None], theirs[None])), known, BAND)
+    agreed = _correlation(detail[3], detail[4], known) ** POWER * known
+    return slots.flatten(), shares * agreed.view(-1, 1), detail[:3].flatten(1)
+
+
+def displacement(render: Tensor, photograph: Tensor, known: Tensor) -> Tensor:
+    """[2,h,w] pixels (right, down): what the render shows at p, the photograph shows at p + displacement(p).
+
+    render, photograph: [h,w] in [0,1]; known: [h,w], 1 where they count, else 0. Smooth, and for some pixels of it.
+    """
+    octaves = [torch.stack((render, photograph, known))]
+    while len(octaves) < OCTAVES and min(octaves[-1].shape[1:]) >= 2 * LEAST_SIDE:
+        octaves.append(F.avg_pool2d(octaves[-1], 2))
+    moved = torch.zeros_like(octaves[-1][:2])
+    for number, planes in enumerate(reversed(octaves)):
+        if number:
+            moved = F.interpolate(2 * moved[None], planes.shape[1:], mode="bilinear", align_corners=False)[0]
+        moved = _improved(moved, planes[:2], (planes[2] > INSIDE).to(planes))
+    return moved
+
+
+def _improved(moved: Tensor, planes: Tensor, known: Tensor) -> Tensor:
+    """A displacement [2,h,w] after ROUNDS of Gauss-Newton steps, of one octave's render and photograph [2,h,w]."""
+    ours, theirs = _band(planes, known, SMOOTH - 2)
+    right = F.pad((ours[:, 2:] - ours[:, :-2]) / 2, (1, 1))
+    down = F.pad((ours[2:] - ours[:-2]) / 2, (0, 0, 1, 1))
+    products = _means(torch.stack((right * right, right * down, down * down)), known, REACH)
+    across, both, along = products[0] + FAINT, products[1], products[2] + FAINT
+    determinant = across * along - both * both
+    for _ in range(ROUNDS):
+        off = _sampled(theirs[None], moved, "bilinear")[0] - ours
+        pull = _means(torch.stack((right * off, down * off)), known, REACH)
+        step = torch.stack((along * pull[0] - both * pull[1], across * pull[1] - both * pull[0])) / determinant
+        moved = _means(moved - step.clamp(-1, 1), known, SMOOTH)
+    return moved
+
+
+def _correlation(ours: Tensor, theirs: Tensor, known: Tensor) -> Tensor:
+    """[h,w] in [0,1], of two bands [h,w] over windows."""
+    products = _means(torch.stack((ours * ours, theirs * theirs, ours * theirs)), known, WINDOW)
+    variances = products[:2].clamp(min=0) + FAINT
+    return (products[2] / (variances[0] * variances[1]).sqrt()).clamp(0, 1)
+
+
+def _band(planes: Tensor, known: Tensor, reach: int) -> Tensor:
+    """Planes [C,h,w] less their means over windows, 0 where not known."""
+    return (planes - _means(planes, known, reach)) * known
+
+
+def _means(planes: Tensor, known: Tensor, reach: int) -> Tensor:
+    """Means of planes [C,h,w] over what is known in the windows that reach so many pixels to each side."""
+    return window_sums(planes * known, reach) / window_sums(known[None], reach).clamp(min=1)
+
+
+def _sampled(planes: Tensor, moved: Tensor, mode: str) -> Tensor:
+    """Planes [C,h,w] at p + moved(p), beyond the border as at it."""
+    height, width = planes.shape[1:]
+    rows = torch.arange(height, device=planes.device)[:, None] + moved[1]
+    columns = torch.arange(width, device=planes.device) + moved[0]
+    grid = torch.stack((columns * (2 / (width - 1)) - 1, rows * (2 / (height - 1)) - 1), -1)
+    return F.grid_sample(planes[None], grid[None], mode, padding_mode="border", align_corners=True)[0]

@@ -415,7 +415,7 @@ def test_half_of_an_optimized_texture_s_finest_detail_is_what_photographs_share(
         "share_detail",
         lambda texture, _, share: asked.append((texture, share)) or texture / 2,
     )
-    texture, _ = texture_function(method)(replace(given, preset=replace(given.preset, turn=0)))
+    texture, _ = texture_function(method)(replace(given, preset=replace(given.preset, turn=0, start="selection")))
     ((before, share),) = asked
     assert share == 0.5
     assert torch.equal(texture, before / 2)

@@ -143,7 +143,7 @@ def _optimized(
         run.level = number + 1
         if not helped:
             break
-    if given.painted is not None and texture is not start:
+    if preset.start == "selection" and texture is not start:
         texture = share_detail(texture.clamp(0, 1), given.maps[1], OPTIMIZED)
     told = probed(run.probed, preset.steps)
     if told is not None:

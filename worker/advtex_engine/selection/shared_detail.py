@@ -18,16 +18,17 @@ from torch import Tensor
 from advtex_engine.render.filtering import window_sums
 from advtex_engine.render.texture import footprints, sample_texels
 from advtex_engine.render.view_maps import ViewMaps, foregrounds
+from advtex_engine.runtime.available_memory import available_memory
 from advtex_engine.runtime.threads import in_threads, one_thread_each
 
+OPTIMIZED = 0.5
+"""Share of the correction for optimized textures: energies of all photographs are in these already, and photographs
+that are moved to be compared are softer."""
 BAND = 2  # pixels to each side; what is wider than such a window is no detail
 WINDOW = 7  # pixels to each side, over which detail is correlated
 POWER = 8  # of the correlation: what agrees by three quarters counts a tenth
 LEAST = 0.01  # what counts less is left out: two pixels of three, and a hundredth of all that counts
 OCTAVES, ROUNDS = 3, 2  # of the displacement: pictures of half the size each, and steps in each
-OPTIMIZED = 0.5
-"""Share of it for textures that were optimized: energies of all photographs are in these already, and photographs that
-are moved to be compared are softer."""
 REACH = 12  # pixels to each side, over which it is one
 SMOOTH = 6  # and over which the found ones are averaged: detail must not be bent to fit
 LEAST_SIDE = 16  # pixels; smaller pictures have no octave of their own
@@ -35,6 +36,9 @@ FAINT = 1e-5
 """Variance of detail, and square of slopes, that count as none; of colors in [0, 1]: three thousandths."""
 MIN_WEIGHT = 0.25  # pixels; a texel that hardly any pixel shows is corrected less
 INSIDE = 0.99  # share of a moved pixel that must lie where its photograph shows the mesh
+ROWS = 64
+AT_ONCE = 4  # views; what they take is not in the run's estimate, whose steps take as much
+BYTES_PER_PIXEL = 300  # of a view, while it is compared
 LUMA = (0.299, 0.587, 0.114)
 
 
@@ -53,9 +57,12 @@ def share_detail(texture: Tensor, maps: ViewMaps, share: float = 1.0) -> Tensor:
         return _agreed_detail(values, maps.only(view))
 
     # One view after the other takes two cores half as long again as a view on each. On a GPU there is nothing to gain.
-    workers = None if maps.device.type == "cpu" else 1
+    at_once = 1
+    if maps.device.type == "cpu":
+        room = available_memory(maps.device) // 2
+        at_once = max(1, min(AT_ONCE, torch.get_num_threads(), room // (BYTES_PER_PIXEL * maps.width * maps.height)))
     with one_thread_each():
-        for slots, shares, detail in in_threads(agreed, foregrounds(maps).nonzero().flatten().tolist(), workers):
+        for slots, shares, detail in in_threads(agreed, foregrounds(maps).nonzero().flatten().tolist(), at_once):
             for channel in range(3):  # index_add_ of short rows takes three times as long on a CPU
                 lacking[:, channel].index_add_(0, slots, (detail[channel, :, None] * shares).flatten())
             weight.index_add_(0, slots, shares.flatten())
@@ -67,7 +74,7 @@ def _agreed_detail(values: Tensor, view: ViewMaps) -> tuple[Tensor, Tensor, Tens
     """What the render lacks of P pixels of a view: slots [P*K], how much each counts there [P,K], detail [3,P]."""
     size = (view.height, view.width)
     seen = view.depth.view(size) > 0
-    slots, shares = footprints(view.uv.view(*size, 2), seen, view.slot_map, areas=True)
+    slots, shares = _footprints(view.uv.view(*size, 2), seen, view.slot_map)
     photograph = view.color.view(*size, 3).permute(2, 0, 1).to(torch.float32) / 255
     render = sample_texels(values, slots, shares).view(*size, 3).permute(2, 0, 1)
     render = torch.where(seen, render, photograph)
@@ -81,7 +88,20 @@ def _agreed_detail(values: Tensor, view: ViewMaps) -> tuple[Tensor, Tensor, Tens
     detail = _band(torch.cat((photograph - render, ours[None], theirs[None])), known, BAND)
     agreed = (_correlation(detail[3], detail[4], known) ** POWER * known).flatten()
     counted = (agreed > LEAST).nonzero()[:, 0]
-    return slots[counted].flatten(), shares[counted] * agreed[counted, None], detail[:3].flatten(1)[:, counted]
+    return slots[counted].long().flatten(), shares[counted] * agreed[counted, None], detail[:3].flatten(1)[:, counted]
+
+
+def _footprints(uv: Tensor, seen: Tensor, slot_map: Tensor) -> tuple[Tensor, Tensor]:
+    """Those of means over areas, some rows after the others: they take six times the room while they are found."""
+    parts = []
+    for first in range(0, len(uv), ROWS):
+        last = min(first + ROWS, len(uv))
+        rows = slice(max(0, first - 1), min(last + 1, len(uv)))  # whose steps to either side count
+        found = footprints(uv[rows], seen[rows], slot_map, areas=True)
+        inside = slice((first - rows.start) * uv.shape[1], (last - rows.start) * uv.shape[1])
+        parts.append([part[inside] for part in found])
+    slots, shares = (torch.cat(part) for part in zip(*parts, strict=True))
+    return slots, shares
 
 
 def displacement(render: Tensor, photograph: Tensor, known: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from advtex_engine.conventions import checked_conventions
 from advtex_engine.core import Diverged, Monitor, TextureConfig, WarningKeeper
 from advtex_engine.core.scene import Mesh
 from advtex_engine.ingest import FrameStore, read_capture
-from advtex_engine.mesh import MAX_FRAMES, fuse, register_mesh
+from advtex_engine.mesh import MAX_FRAMES, fuse, grow_borders, register_mesh
 from advtex_engine.methods import require, texture_function
 from advtex_engine.metrics.speckle import speckle_share
 from advtex_engine.previews.curves import curves
@@ -188,5 +188,8 @@ def _scene(
             made["normal_map"] = keep_detail(preparation, stages.folder)
             capture, made["view_choice"] = capture.choose(mesh, config.max_views, monitor)
             scene = capture.scene(mesh, monitor)
+            edge = preparation.scanned_edge()
+            if edge is not None:
+                scene = replace(scene, mesh=grow_borders(scene.mesh, edge, scene.views))
             begin_charts(scene.mesh, charts)
     return scene, made

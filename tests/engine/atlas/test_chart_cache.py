@@ -288,6 +288,7 @@ def test_what_is_said_of_a_mesh_that_is_made_ready_is_said_on_the_runs_thread() 
         assert maker._begun is None  # charts of a mesh that moves would be of no use
         preparation.begin(Mesh(mesh.v_pos, mesh.t_pos_idx))
         preparation.result(Told())
+        assert preparation.scanned_edge() is None
         assert maker._begun is not None
         preparation.begin(Mesh(mesh.v_pos * 0, mesh.t_pos_idx))
         with pytest.raises(ScanError, match="has an area"):
@@ -298,6 +299,7 @@ def test_what_is_said_of_a_mesh_that_is_made_ready_is_said_on_the_runs_thread() 
 
 @pytest.mark.slow
 def test_charts_are_begun_while_frames_are_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of a mesh that is not decimated: the borders of others grow by what the frames show."""
     scan = tmp_path / "scan"
     synthesize(scan, views=4, width=96, height=72)
     begun = threading.Event()
@@ -315,7 +317,7 @@ def test_charts_are_begun_while_frames_are_decoded(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(chart_cache, "make_charts", make)
     monkeypatch.setattr(ingest, "color_image", decode_later)
     monkeypatch.setattr(pipeline, "charts_folder", lambda: tmp_path / "charts")
-    config = TextureConfig(face_budget=500, refine=False, device="cpu")
+    config = TextureConfig(refine=False, device="cpu")
     with pytest.raises(Stopped):
         pipeline.texture_scan(scan, tmp_path / "out", config, work=tmp_path / "work", monitor=UntilAtlas())
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 import trimesh
 
 from advtex_engine.core.monitor import Monitor
-from advtex_engine.core.scene import Mesh
+from advtex_engine.core.scene import Camera, Mesh, View
 from advtex_engine.mesh.borders import close_pinholes, fill_notches, grow_borders, mend_borders
 from advtex_engine.mesh.clean import decimate
 
@@ -81,23 +84,66 @@ def test_a_drawn_mesh_keeps_its_openings() -> None:
     assert decimate(opened, 80_000, Monitor()) is opened
 
 
-def test_borders_grow_outward_in_their_plane_and_nothing_else_moves() -> None:
+def flat(x: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
+    return torch.full_like(x, 10.0)
+
+
+def above(side: int, depth: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]) -> View:
+    """What a camera sees that looks down on `grid(side)` from 10 m, a margin of a metre included, 40 pixels a metre.
+
+    depth: of the pixels' world x and y [H,W], metres.
+    """
+    pixels = 40 * (side + 2)
+    K = torch.tensor([[400.0, 0, pixels / 2], [0, 400.0, pixels / 2], [0, 0, 1]], dtype=torch.float64)
+    # x right, y down, z forward: turned by half a turn about the world's x.
+    camera_to_world = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    camera_to_world[:3, 3] = torch.tensor([side / 2, side / 2, 10.0])
+    camera = Camera(K, torch.linalg.inv(camera_to_world), pixels, pixels)
+    across = (torch.arange(pixels) + 0.5) / 40 - 1
+    y, x = torch.meshgrid(side - across, across, indexing="ij")
+    color = torch.zeros((pixels, pixels, 3), dtype=torch.uint8)
+    return View("", camera, color, depth=depth(x, y).float())
+
+
+def test_borders_grow_outward_where_depth_shows_that_the_surface_goes_on() -> None:
     sheet = grid(10, without={2 * (10 * y + x) + side for y in range(4, 6) for x in range(4, 6) for side in (0, 1)})
-    grown = grow_borders(sheet, 0.1)
+
+    def ten(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        """Goes on by .3 m to the left, without end above, not at all to the right; below there are no readings."""
+        depth = torch.where((x < -0.3) | (x > 10), 12.0, 10.0)
+        return torch.where(y < 0, 0.0, depth)
+
+    views = [above(10, ten)] * 2
+    grown = grow_borders(sheet, 1.0, views)
     before, after = sheet.v_pos, grown.v_pos
     assert grown.t_pos_idx is sheet.t_pos_idx
-    moved = (after - before).norm(dim=1)
-    inside = ((before[:, :2] - 5).abs().amax(1) < 5) & ((before[:, :2] - 5).abs().amax(1) > 1)
-    assert float(moved[inside].max()) == 0.0
-    assert float(moved.max()) <= 0.1 + 1e-6
-    assert torch.equal(after[:, 2], before[:, 2])
-    left = (before[:, 0] == 0) & (before[:, 1] > 0) & (before[:, 1] < 10)
-    np.testing.assert_allclose(after[left], before[left] - torch.tensor([0.1, 0.0, 0.0]), atol=1e-6)
-    into_the_hole = (before == torch.tensor([4.0, 5.0, 0.0])).all(dim=1)
-    np.testing.assert_allclose(after[into_the_hole], [[4.1, 5.0, 0.0]], atol=1e-6)
+    moved = after - before
+    middle = (before[:, :2] > 0).all(1) & (before[:, :2] < 10).all(1)
+    inside = middle & ((before[:, :2] - 5).abs().amax(1) > 1)
+    assert float(moved[inside].norm(dim=1).max()) == 0.0
+    assert float(moved[:, 2].abs().max()) == 0.0
+    left, low = before[:, 0] == 0, before[:, 1] == 0
+    along_x, along_y = ((before[:, axis] > 0) & (before[:, axis] < 10) for axis in (0, 1))
+    for place, step in (
+        (left & along_y, (-0.15, 0.0)),
+        ((before[:, 1] == 10) & along_x, (0.0, 0.5)),
+        ((before[:, 0] == 10) & along_y, (0.0, 0.0)),
+        (low & along_x, (0.0, 0.0)),
+        ((before == torch.tensor([4.0, 5.0, 0.0])).all(dim=1), (0.5, 0.0)),  # into the hole
+    ):
+        assert bool(place.any())
+        np.testing.assert_allclose(moved[place, :2], torch.tensor(step).expand(int(place.sum()), 2), atol=1e-6)
+
+
+def test_borders_stay_where_too_few_look() -> None:
+    sheet = grid(10, without=set())
+    view = above(10, flat)
+    assert torch.equal(grow_borders(sheet, 1.0, [view]).v_pos, sheet.v_pos)
+    assert torch.equal(grow_borders(sheet, 1.0, [replace(view, depth=None)] * 3).v_pos, sheet.v_pos)
+    assert not torch.equal(grow_borders(sheet, 1.0, [view] * 2).v_pos, sheet.v_pos)
 
 
 def test_a_closed_mesh_does_not_grow() -> None:
     sphere = trimesh.creation.icosphere(subdivisions=2)
     mesh = make(sphere.vertices.tolist(), sphere.faces.tolist())
-    assert torch.equal(grow_borders(mesh, 0.1).v_pos, mesh.v_pos)
+    assert torch.equal(grow_borders(mesh, 0.1, [above(2, flat)] * 2).v_pos, mesh.v_pos)

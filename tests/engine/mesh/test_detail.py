@@ -29,7 +29,7 @@ def panel(noise: float, relief: float, cells: int = 100, everywhere: bool = Fals
     ("noise", "relief", "everywhere", "why"),
     [
         (0.0, 0.01, False, "decimation took shape"),
-        (0.0002, 0.01, False, "decimation took shape"),
+        (0.0001, 0.01, False, "decimation took shape"),
         (0.0015, 0.01, False, "carve the noise"),
         (0.0015, 0.0, False, "carve the noise"),
         (0.0, 0.01, True, "carve the noise"),  # as strong all over: it cannot be told from noise

@@ -13,6 +13,7 @@ from advtex_engine.atlas.chart_cache import ChartMaker
 from advtex_engine.core.errors import Problem
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Mesh
+from advtex_engine.mesh.borders import median_edge
 from advtex_engine.mesh.clean import clean, decimate
 from advtex_engine.mesh.detail import Detail, find_detail
 from advtex_engine.mesh.holes import close_holes
@@ -38,13 +39,14 @@ class _Prepared:
     problems: list[Problem]
     detail: Detail | None
     normal_map: dict[str, Any]
+    scanned_edge: float | None
 
 
 class MeshPreparation:
     """Cleans, trims and decimates a mesh on a thread of its own; a context manager that leaves no thread behind.
 
     box: all outside is left out. holes: those with a border no longer than this are closed, metres. The charts are
-    begun there as well where the mesh will stay as it is.
+    begun there as well where the mesh will stay as it is: one that was decimated has its borders to be grown.
     """
 
     def __init__(
@@ -92,6 +94,11 @@ class MeshPreparation:
         prepared = self._prepared.result()
         return prepared.detail, prepared.normal_map
 
+    def scanned_edge(self) -> float | None:
+        """Median edge, metres, of what the mesh that `result` gives was decimated from; None if it was not."""
+        assert self._prepared is not None
+        return self._prepared.result().scanned_edge
+
     def _reduce(self, mesh: Mesh) -> tuple[Mesh, list[Problem]]:
         said = _Said()
         return decimate(clean(mesh), self._face_budget, said), said.problems
@@ -108,14 +115,17 @@ class MeshPreparation:
         closed, holes = (prepared, 0) if self._holes is None else close_holes(prepared, self._holes)
         if holes and prepared.v_uv is not None:
             said.warning(_uv_dropped(holes))
-        if not moves:
+        edge = None if prepared is kept else median_edge(kept)
+        if not moves and edge is None:
             begin_charts(closed, self._charts)
         outside, added = (
             len(cleaned.t_pos_idx) - len(cropped.t_pos_idx),
             len(closed.t_pos_idx) - len(prepared.t_pos_idx),
         )
         detail, normal_map = find_detail(kept, prepared)
-        return _Prepared(closed, Trimmed(outside, floaters, lost, holes, added), said.problems, detail, normal_map)
+        return _Prepared(
+            closed, Trimmed(outside, floaters, lost, holes, added), said.problems, detail, normal_map, edge
+        )
 
 
 def _floaters_dropped(floaters: int, faces: int) -> Problem:

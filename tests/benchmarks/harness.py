@@ -30,10 +30,9 @@ from torch import Tensor
 from advtex_engine.atlas.build import build_atlas
 from advtex_engine.core.config import TextureConfig, resolve_preset
 from advtex_engine.core.monitor import Monitor
-from advtex_engine.core.scene import Atlas, Camera, Mesh, View
+from advtex_engine.core.scene import Atlas, Camera, DepthFrame, Mesh, View
 from advtex_engine.coverage import complete_texture
 from advtex_engine.ingest.read import ingest
-from advtex_engine.mesh.borders import grow_borders, median_edge
 from advtex_engine.mesh.clean import clean, decimate
 from advtex_engine.mesh.models import load_model
 from advtex_engine.methods import MethodInput, texture_function
@@ -112,11 +111,11 @@ def prepare(scan: Path, config: TextureConfig, work: Path, device: torch.device,
     """A scan as methods take it: every `every`-th view, refined where the configuration says so."""
     monitor = Monitor()
     scene = ingest(scan, config, monitor)
-    scanned = clean(scene.mesh)
-    mesh, views = decimate(scanned, config.face_budget, monitor), scene.views[::every]
-    if mesh is not scanned:
-        mesh = grow_borders(mesh, median_edge(scanned), views)
-    scene = dataclasses.replace(scene, views=views, mesh=mesh)
+    views = scene.views[::every]
+    frames = [DepthFrame(view.camera, view.depth) for view in views if view.depth is not None]
+    scene = dataclasses.replace(
+        scene, views=views, mesh=decimate(clean(scene.mesh), config.face_budget, monitor, frames)
+    )
     if config.refines:
         scene = apply_refinement(scene, refine_scene(scene, device, config.seed))
     atlas = build_atlas(scene.mesh, [view.camera for view in scene.views], config, monitor)

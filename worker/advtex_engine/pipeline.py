@@ -16,9 +16,9 @@ from advtex_engine.atlas import ChartMaker, MeshPreparation, begin_charts, chart
 from advtex_engine.budget import Budget
 from advtex_engine.conventions import checked_conventions
 from advtex_engine.core import Diverged, Monitor, TextureConfig, WarningKeeper
-from advtex_engine.core.scene import Mesh
-from advtex_engine.ingest import FrameStore, read_capture
-from advtex_engine.mesh import MAX_FRAMES, fuse, grow_borders, register_mesh
+from advtex_engine.core.scene import DepthFrame, Mesh
+from advtex_engine.ingest import Capture, FrameStore, read_capture
+from advtex_engine.mesh import LOOKS, MAX_FRAMES, fuse, register_mesh
 from advtex_engine.methods import require, texture_function
 from advtex_engine.metrics.speckle import speckle_share
 from advtex_engine.previews.curves import curves
@@ -170,12 +170,15 @@ def _scene(
                 monitor,
                 lambda mesh, moves, up: preparation.begin(mesh, up_axis=up, moves=moves != "none"),
             )
+            if capture.mesh is not None:
+                preparation.look(_looks(capture, capture.mesh, config))
         with stages.run("conventions"):
             made["conventions"] = checked_conventions(scan, capture.manifest, capture.mesh, monitor)
         if capture.mesh is None:
             with stages.run("fusion"):
                 fused, made["fusion"] = fuse(capture.measured(), device, monitor)
             preparation.begin(fused, up_axis=capture.up_axis)
+            preparation.look(_looks(capture, fused, config))
         with stages.run("geometry"):
             frames = [] if capture.mesh_refinement == "none" else capture.measured(MAX_FRAMES)
 
@@ -188,8 +191,10 @@ def _scene(
             made["normal_map"] = keep_detail(preparation, stages.folder)
             capture, made["view_choice"] = capture.choose(mesh, config.max_views, monitor)
             scene = capture.scene(mesh, monitor)
-            edge = preparation.scanned_edge()
-            if edge is not None:
-                scene = replace(scene, mesh=grow_borders(scene.mesh, edge, scene.views))
             begin_charts(scene.mesh, charts)
     return scene, made
+
+
+def _looks(capture: Capture, mesh: Mesh, config: TextureConfig) -> list[DepthFrame]:
+    """Depth for what decimation does to the borders of the mesh; none where it is within the budget."""
+    return capture.measured(LOOKS) if len(mesh.t_pos_idx) > config.face_budget else []

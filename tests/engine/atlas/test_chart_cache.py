@@ -288,7 +288,6 @@ def test_what_is_said_of_a_mesh_that_is_made_ready_is_said_on_the_runs_thread() 
         assert maker._begun is None  # charts of a mesh that moves would be of no use
         preparation.begin(Mesh(mesh.v_pos, mesh.t_pos_idx))
         preparation.result(Told())
-        assert preparation.scanned_edge() is None
         assert maker._begun is not None
         preparation.begin(Mesh(mesh.v_pos * 0, mesh.t_pos_idx))
         with pytest.raises(ScanError, match="has an area"):

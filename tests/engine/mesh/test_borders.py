@@ -11,7 +11,7 @@ import torch
 import trimesh
 
 from advtex_engine.core.monitor import Monitor
-from advtex_engine.core.scene import Camera, Mesh, View
+from advtex_engine.core.scene import Camera, DepthFrame, Mesh
 from advtex_engine.mesh.borders import close_pinholes, fill_notches, grow_borders, mend_borders
 from advtex_engine.mesh.clean import decimate
 
@@ -29,6 +29,26 @@ def grid(side: int, without: set[int]) -> Mesh:
             a, b = y * (side + 1) + x, (y + 1) * (side + 1) + x
             faces += [[a, a + 1, b + 1], [a, b + 1, b]]
     return make(positions, [face for index, face in enumerate(faces) if index not in without])
+
+
+def flat(x: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
+    return torch.full_like(x, 10.0)
+
+
+def above(side: int, depth: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]) -> DepthFrame:
+    """Of a camera that looks down on `grid(side)` and a metre around it from 10 m, 40 pixels a metre.
+
+    depth: of the pixels' world x and y [H,W], metres.
+    """
+    pixels = 40 * (side + 2)
+    K = torch.tensor([[400.0, 0, pixels / 2], [0, 400.0, pixels / 2], [0, 0, 1]], dtype=torch.float64)
+    # x right, y down, z forward: turned by half a turn about the world's x.
+    camera_to_world = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    camera_to_world[:3, 3] = torch.tensor([side / 2, side / 2, 10.0])
+    camera = Camera(K, torch.linalg.inv(camera_to_world), pixels, pixels)
+    across = (torch.arange(pixels) + 0.5) / 40 - 1
+    y, x = torch.meshgrid(side - across, across, indexing="ij")
+    return DepthFrame(camera, depth(x, y).float())
 
 
 def area_vectors(mesh: Mesh) -> torch.Tensor:
@@ -63,17 +83,24 @@ def test_a_toothed_border_is_straightened_and_nothing_else() -> None:
     side = 10
     teeth = {2 * (side * (side - 1) + x) + 1 for x in range(side)}  # the upper triangle of each cell of the last row
     toothed = grid(side, teeth)
-    filled = fill_notches(toothed)
+    filled = fill_notches(toothed, [above(side, flat)] * 2)
     areas = area_vectors(filled)[:, 2]
     assert bool((areas > 0).all())
     # The first cell's tooth has no neighbor to the left: it is a slope, not a notch.
     assert float(areas.sum()) == pytest.approx(side * side - 0.5)
 
 
+def test_teeth_stay_where_the_frames_look_past_them() -> None:
+    toothed = grid(10, {2 * (10 * 9 + x) + 1 for x in range(10)})
+    between = above(10, lambda _, y: torch.where(y > 9, 12.0, 10.0))
+    assert fill_notches(toothed, [between] * 2) is toothed
+    assert fill_notches(toothed, []) is toothed
+
+
 def test_corners_wider_than_a_notch_stay() -> None:
     missing = {2 * (10 * y + x) + part for y in range(5, 10) for x in range(5, 10) for part in (0, 1)}
     corner = grid(10, missing)
-    filled = float(area_vectors(mend_borders(corner))[:, 2].sum())
+    filled = float(area_vectors(mend_borders(corner, [above(10, flat)] * 2))[:, 2].sum())
     assert filled - float(area_vectors(corner)[:, 2].sum()) <= 2.0
 
 
@@ -84,27 +111,6 @@ def test_a_drawn_mesh_keeps_its_openings() -> None:
     assert decimate(opened, 80_000, Monitor()) is opened
 
 
-def flat(x: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
-    return torch.full_like(x, 10.0)
-
-
-def above(side: int, depth: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]) -> View:
-    """What a camera sees that looks down on `grid(side)` from 10 m, a margin of a metre included, 40 pixels a metre.
-
-    depth: of the pixels' world x and y [H,W], metres.
-    """
-    pixels = 40 * (side + 2)
-    K = torch.tensor([[400.0, 0, pixels / 2], [0, 400.0, pixels / 2], [0, 0, 1]], dtype=torch.float64)
-    # x right, y down, z forward: turned by half a turn about the world's x.
-    camera_to_world = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-    camera_to_world[:3, 3] = torch.tensor([side / 2, side / 2, 10.0])
-    camera = Camera(K, torch.linalg.inv(camera_to_world), pixels, pixels)
-    across = (torch.arange(pixels) + 0.5) / 40 - 1
-    y, x = torch.meshgrid(side - across, across, indexing="ij")
-    color = torch.zeros((pixels, pixels, 3), dtype=torch.uint8)
-    return View("", camera, color, depth=depth(x, y).float())
-
-
 def test_borders_grow_outward_where_depth_shows_that_the_surface_goes_on() -> None:
     sheet = grid(10, without={2 * (10 * y + x) + side for y in range(4, 6) for x in range(4, 6) for side in (0, 1)})
 
@@ -113,8 +119,7 @@ def test_borders_grow_outward_where_depth_shows_that_the_surface_goes_on() -> No
         depth = torch.where((x < -0.3) | (x > 10), 12.0, 10.0)
         return torch.where(y < 0, 0.0, depth)
 
-    views = [above(10, ten)] * 2
-    grown = grow_borders(sheet, 1.0, views)
+    grown = grow_borders(sheet, 1.0, [above(10, ten)] * 2)
     before, after = sheet.v_pos, grown.v_pos
     assert grown.t_pos_idx is sheet.t_pos_idx
     moved = after - before
@@ -137,10 +142,11 @@ def test_borders_grow_outward_where_depth_shows_that_the_surface_goes_on() -> No
 
 def test_borders_stay_where_too_few_look() -> None:
     sheet = grid(10, without=set())
-    view = above(10, flat)
-    assert torch.equal(grow_borders(sheet, 1.0, [view]).v_pos, sheet.v_pos)
-    assert torch.equal(grow_borders(sheet, 1.0, [replace(view, depth=None)] * 3).v_pos, sheet.v_pos)
-    assert not torch.equal(grow_borders(sheet, 1.0, [view] * 2).v_pos, sheet.v_pos)
+    frame = above(10, flat)
+    unsure = replace(frame, confidence=torch.zeros_like(frame.depth))
+    for frames in ([], [frame], [frame, unsure]):
+        assert torch.equal(grow_borders(sheet, 1.0, frames).v_pos, sheet.v_pos)
+    assert not torch.equal(grow_borders(sheet, 1.0, [frame] * 2).v_pos, sheet.v_pos)
 
 
 def test_a_closed_mesh_does_not_grow() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from types import TracebackType
@@ -12,8 +12,7 @@ from advtex_engine.atlas.build import begin_charts
 from advtex_engine.atlas.chart_cache import ChartMaker
 from advtex_engine.core.errors import Problem
 from advtex_engine.core.monitor import Monitor
-from advtex_engine.core.scene import Mesh
-from advtex_engine.mesh.borders import median_edge
+from advtex_engine.core.scene import DepthFrame, Mesh
 from advtex_engine.mesh.clean import clean, decimate
 from advtex_engine.mesh.detail import Detail, find_detail
 from advtex_engine.mesh.holes import close_holes
@@ -39,14 +38,13 @@ class _Prepared:
     problems: list[Problem]
     detail: Detail | None
     normal_map: dict[str, Any]
-    scanned_edge: float | None
 
 
 class MeshPreparation:
     """Cleans, trims and decimates a mesh on a thread of its own; a context manager that leaves no thread behind.
 
     box: all outside is left out. holes: those with a border no longer than this are closed, metres. The charts are
-    begun there as well where the mesh will stay as it is: one that was decimated has its borders to be grown.
+    begun there as well where the mesh will stay as it is. One that has to be decimated waits for `look`.
     """
 
     def __init__(
@@ -57,11 +55,13 @@ class MeshPreparation:
         self._up_axis = "+z"
         self._reduced: Future[tuple[Mesh, list[Problem]]] | None = None  # of a mesh that moves
         self._prepared: Future[_Prepared] | None = None
+        self._frames = Future[Sequence[DepthFrame]]()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        self.look(())
         self._pool.shutdown()
 
     def begin(self, mesh: Mesh, *, up_axis: str = "+z", moves: bool = False) -> None:
@@ -71,11 +71,18 @@ class MeshPreparation:
         self._reduced = self._pool.submit(self._reduce, mesh) if moves else None
         self._prepared = None if moves else self._pool.submit(self._prepare, mesh, up_axis, False)
 
+    def look(self, frames: Sequence[DepthFrame]) -> None:
+        """Gives what the depth camera measured, for `decimate`; only the first time counts."""
+        if not self._frames.done():
+            self._frames.set_result(frames)
+
     def result(self, monitor: Monitor, move: Callable[[Mesh], Mesh] | None = None) -> tuple[Mesh, dict[str, Any]]:
         """The mesh that was begun with, once it is ready, and what was trimmed of it, for the report.
 
-        move: of a mesh that moves. Raises what it, `clean` and `crop` do, and tells the monitor the rest.
+        move: of a mesh that moves. Without `look` before it, the mesh is decimated by itself. Raises what it, `clean`
+        and `crop` do, and tells the monitor the rest.
         """
+        self.look(())
         if self._prepared is None:
             assert self._reduced is not None
             reduced, said = self._reduced.result()
@@ -94,11 +101,6 @@ class MeshPreparation:
         prepared = self._prepared.result()
         return prepared.detail, prepared.normal_map
 
-    def scanned_edge(self) -> float | None:
-        """Median edge, metres, of what the mesh that `result` gives was decimated from; None if it was not."""
-        assert self._prepared is not None
-        return self._prepared.result().scanned_edge
-
     def _reduce(self, mesh: Mesh) -> tuple[Mesh, list[Problem]]:
         said = _Said()
         return decimate(clean(mesh), self._face_budget, said), said.problems
@@ -111,21 +113,19 @@ class MeshPreparation:
         lost = len(cropped.t_pos_idx) - len(kept.t_pos_idx)
         if floaters:
             said.warning(_floaters_dropped(floaters, lost))
-        prepared = decimate(kept, self._face_budget, said)
+        frames = self._frames.result() if len(kept.t_pos_idx) > self._face_budget else ()
+        prepared = decimate(kept, self._face_budget, said, frames)
         closed, holes = (prepared, 0) if self._holes is None else close_holes(prepared, self._holes)
         if holes and prepared.v_uv is not None:
             said.warning(_uv_dropped(holes))
-        edge = None if prepared is kept else median_edge(kept)
-        if not moves and edge is None:
+        if not moves:
             begin_charts(closed, self._charts)
         outside, added = (
             len(cleaned.t_pos_idx) - len(cropped.t_pos_idx),
             len(closed.t_pos_idx) - len(prepared.t_pos_idx),
         )
         detail, normal_map = find_detail(kept, prepared)
-        return _Prepared(
-            closed, Trimmed(outside, floaters, lost, holes, added), said.problems, detail, normal_map, edge
-        )
+        return _Prepared(closed, Trimmed(outside, floaters, lost, holes, added), said.problems, detail, normal_map)
 
 
 def _floaters_dropped(floaters: int, faces: int) -> Problem:

@@ -14,17 +14,18 @@ import numpy.typing as npt
 import torch
 
 from advtex_engine.core.cameras import project
-from advtex_engine.core.scene import Mesh, View
+from advtex_engine.core.scene import DepthFrame, Mesh
 
 PINHOLE_EDGES = 12  # larger holes are what the scanner did not see
 NOTCH_WIDTH = 2.0  # of the mesh's median edge
 NOTCH_PASSES = 4  # each halves what is left
 MIN_COSINE = 0.5  # between a notch's triangle and the faces beside it
 # What collapsing along a border cuts off. A thousandth of a kitchen's pixels were missed for want of it, each a black
-# speck; grown everywhere, a rendered room's open edges stuck out by a pixel.
+# speck; grown everywhere, a rendered room's open edges stuck out by a pixel, as they did where notches were filled.
 GROWTHS = (0.5, 0.15)
 DEPTH_ACCURACY = 0.012  # of the distance
 MIN_LOOKS = 2
+LOOKS = 128  # frames that are asked, of a long scan every so many: neighbors see the same
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -36,18 +37,22 @@ def median_edge(mesh: Mesh) -> float:
     return float(np.median(np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)))
 
 
-def mend_borders(mesh: Mesh) -> Mesh:
+def mend_borders(mesh: Mesh, frames: Sequence[DepthFrame]) -> Mesh:
     """A clean mesh with notches filled and pinholes closed, without uv."""
     bare = Mesh(mesh.v_pos, mesh.t_pos_idx)
-    return close_pinholes(fill_notches(bare))
+    return close_pinholes(fill_notches(bare, frames))
 
 
-def fill_notches(mesh: Mesh) -> Mesh:
-    """A triangle into every concave corner of the border that is at most NOTCH_WIDTH wide, narrow ones first."""
+def fill_notches(mesh: Mesh, frames: Sequence[DepthFrame]) -> Mesh:
+    """A triangle into every concave corner of the border that is at most NOTCH_WIDTH wide, narrow ones first.
+
+    Only where the frames show that the surface goes on (`grow_borders`).
+    """
     position, faces = mesh.v_pos.numpy().astype(np.float64), mesh.t_pos_idx.numpy()
     widest = NOTCH_WIDTH * median_edge(mesh)
-    for _ in range(NOTCH_PASSES):
+    for _ in range(NOTCH_PASSES if frames else 0):
         added = _notches(position, faces, widest)
+        added = added[_goes_on(position[added].mean(axis=1), frames)]
         if len(added) == 0:
             break
         faces = np.concatenate((faces, added))
@@ -82,12 +87,12 @@ def close_pinholes(mesh: Mesh) -> Mesh:
     )
 
 
-def grow_borders(mesh: Mesh, scanned_edge: float, views: Sequence[View]) -> Mesh:
+def grow_borders(mesh: Mesh, scanned_edge: float, frames: Sequence[DepthFrame]) -> Mesh:
     """A decimated mesh's border moved outward in its faces' plane, less at sharp corners, where the surface goes on.
 
     scanned_edge: median edge of the mesh before it was decimated, metres; a vertex moves by the largest share of it in
-    GROWTHS at which more depth images of the views show a surface than look past it, and MIN_LOOKS at least: by itself
-    the edge of a thing looks as the end of what was scanned. On the CPU.
+    GROWTHS at which more frames have a reading than one behind it, and MIN_LOOKS at least: by itself the edge of a
+    thing looks as the end of what was scanned. On the CPU.
     """
     position = mesh.v_pos.numpy().astype(np.float64)
     edges, normals = border(mesh.v_pos.numpy(), mesh.t_pos_idx.numpy())
@@ -102,25 +107,25 @@ def grow_borders(mesh: Mesh, scanned_edge: float, views: Sequence[View]) -> Mesh
     grown, still = position.copy(), np.ones(len(on_border), dtype=bool)
     for growth in GROWTHS:
         place = position[on_border] + growth * offset
-        moves = still & _goes_on(place, views)
+        moves = still & _goes_on(place, frames)
         grown[on_border[moves]] = place[moves]
         still &= ~moves
     return Mesh(torch.from_numpy(grown.astype(np.float32)), mesh.t_pos_idx)
 
 
-def _goes_on(place: Floats, views: Sequence[View]) -> npt.NDArray[np.bool_]:
-    """[N] bool: whether more views have a depth reading at the places [N,3] than one behind them."""
+def _goes_on(place: Floats, frames: Sequence[DepthFrame]) -> npt.NDArray[np.bool_]:
+    """[N] bool: whether there is a surface at the places [N,3], as more frames say than look past it."""
     points = torch.from_numpy(place)
     there, behind = torch.zeros(len(points), dtype=torch.int64), torch.zeros(len(points), dtype=torch.int64)
-    for view in views:
-        if view.depth is None:
-            continue
-        pixel, z = project(view.camera, points)
-        height, width = view.depth.shape
+    for frame in frames:
+        pixel, z = project(frame.camera, points)
+        height, width = frame.depth.shape
         inside = (z > 0) & (pixel >= 0).all(1) & (pixel < pixel.new_tensor((width, height))).all(1)
         x, y = pixel[inside].long().unbind(1)
-        measured = view.depth[y, x].double()
+        measured = frame.depth[y, x].double()
         read, further = measured > 0, measured - z[inside]
+        if frame.confidence is not None:
+            read &= frame.confidence[y, x] > 0
         there[inside] += read & (further.abs() < DEPTH_ACCURACY * z[inside])
         behind[inside] += read & (further > DEPTH_ACCURACY * z[inside])
     return np.asarray((there > behind) & (there >= MIN_LOOKS))

@@ -22,7 +22,7 @@ NOTCH_PASSES = 4  # each halves what is left
 MIN_COSINE = 0.5  # between a notch's triangle and the faces beside it
 # What collapsing along a border cuts off. A thousandth of a kitchen's pixels were missed for want of it, each a black
 # speck; grown everywhere, a rendered room's open edges stuck out by a pixel, as they did where notches were filled.
-GROWTHS = (0.5, 0.15)
+GROWTH, SURE_GROWTH = 0.15, 0.5
 DEPTH_ACCURACY = 0.012  # of the distance
 MIN_LOOKS = 2
 LOOKS = 128  # frames that are asked, of a long scan every so many: neighbors see the same
@@ -46,13 +46,14 @@ def mend_borders(mesh: Mesh, frames: Sequence[DepthFrame]) -> Mesh:
 def fill_notches(mesh: Mesh, frames: Sequence[DepthFrame]) -> Mesh:
     """A triangle into every concave corner of the border that is at most NOTCH_WIDTH wide, narrow ones first.
 
-    Only where the frames show that the surface goes on (`grow_borders`).
+    Only where no more frames look past it than have a reading there.
     """
     position, faces = mesh.v_pos.numpy().astype(np.float64), mesh.t_pos_idx.numpy()
     widest = NOTCH_WIDTH * median_edge(mesh)
-    for _ in range(NOTCH_PASSES if frames else 0):
+    for _ in range(NOTCH_PASSES):
         added = _notches(position, faces, widest)
-        added = added[_goes_on(position[added].mean(axis=1), frames)]
+        there, behind = _readings(position[added].mean(axis=1), frames)
+        added = added[there >= behind]
         if len(added) == 0:
             break
         faces = np.concatenate((faces, added))
@@ -90,9 +91,9 @@ def close_pinholes(mesh: Mesh) -> Mesh:
 def grow_borders(mesh: Mesh, scanned_edge: float, frames: Sequence[DepthFrame]) -> Mesh:
     """A decimated mesh's border moved outward in its faces' plane, less at sharp corners, where the surface goes on.
 
-    scanned_edge: median edge of the mesh before it was decimated, metres; a vertex moves by the largest share of it in
-    GROWTHS at which more frames have a reading than one behind it, and MIN_LOOKS at least: by itself the edge of a
-    thing looks as the end of what was scanned. On the CPU.
+    scanned_edge: median edge of the mesh before it was decimated, metres. A vertex moves by GROWTH of it unless more
+    frames look past the place than have a reading there: by itself the edge of a thing looks as the end of what was
+    scanned. By SURE_GROWTH where MIN_LOOKS have a reading, and more than look past it. On the CPU.
     """
     position = mesh.v_pos.numpy().astype(np.float64)
     edges, normals = border(mesh.v_pos.numpy(), mesh.t_pos_idx.numpy())
@@ -104,17 +105,17 @@ def grow_borders(mesh: Mesh, scanned_edge: float, frames: Sequence[DepthFrame]) 
         np.add.at(share, corner, length)
     on_border = np.flatnonzero(share)
     offset = offset[on_border] * scanned_edge / share[on_border, None]
-    grown, still = position.copy(), np.ones(len(on_border), dtype=bool)
-    for growth in GROWTHS:
+    grown = position.copy()
+    for growth, least, ahead in ((GROWTH, 0, 0), (SURE_GROWTH, MIN_LOOKS, 1)):
         place = position[on_border] + growth * offset
-        moves = still & _goes_on(place, frames)
+        there, behind = _readings(place, frames)
+        moves = (there >= least) & (there >= behind + ahead)
         grown[on_border[moves]] = place[moves]
-        still &= ~moves
     return Mesh(torch.from_numpy(grown.astype(np.float32)), mesh.t_pos_idx)
 
 
-def _goes_on(place: Floats, frames: Sequence[DepthFrame]) -> npt.NDArray[np.bool_]:
-    """[N] bool: whether there is a surface at the places [N,3], as more frames say than look past it."""
+def _readings(place: Floats, frames: Sequence[DepthFrame]) -> tuple[Integers, Integers]:
+    """How many frames have a reading at each place, and how many one behind it, [N] each."""
     points = torch.from_numpy(place)
     there, behind = torch.zeros(len(points), dtype=torch.int64), torch.zeros(len(points), dtype=torch.int64)
     for frame in frames:
@@ -128,7 +129,7 @@ def _goes_on(place: Floats, frames: Sequence[DepthFrame]) -> npt.NDArray[np.bool
             read &= frame.confidence[y, x] > 0
         there[inside] += read & (further.abs() < DEPTH_ACCURACY * z[inside])
         behind[inside] += read & (further > DEPTH_ACCURACY * z[inside])
-    return np.asarray((there > behind) & (there >= MIN_LOOKS))
+    return there.numpy(), behind.numpy()
 
 
 def _notches(position: Floats, faces: Integers, widest: float) -> Integers:

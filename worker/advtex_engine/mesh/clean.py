@@ -55,7 +55,7 @@ def decimate(mesh: Mesh, face_budget: int, monitor: Monitor, frames: Sequence[De
     """At most `face_budget` faces of a clean mesh, by quadric edge collapse; deterministic.
 
     A mesh within the budget is returned as it is, uv included. Else its borders are mended before, and what collapsing
-    cuts off of them is given back after, as far as the frames, in the mesh's world, show that the surface goes on.
+    cuts off of them is given back after, unless the frames, in the mesh's world, look past it.
     Decimation moves vertices across uv seams, so that uv are dropped, which the monitor is told.
     """
     if len(mesh.t_pos_idx) <= face_budget:

@@ -174,21 +174,25 @@ class _Grid:
         spans = torch.minimum(((piece.amax(1) + reach - low) / size).floor().long(), counts - 1) - lowest + 1
         total = spans.prod(1)
         entry = torch.repeat_interleave(torch.arange(len(piece)), total)
-        place = torch.arange(len(entry)) - (total.cumsum(0) - total)[entry]
-        inner = spans[entry]
-        step = torch.stack(
-            (place // (inner[:, 1] * inner[:, 2]), place // inner[:, 2] % inner[:, 1], place % inner[:, 2]), 1
-        )
-        cell = lowest[entry] + step
+        place = torch.arange(len(entry)).sub_((total.cumsum(0) - total).index_select(0, entry)).int()
+        across, deep = (spans[:, axis].int().index_select(0, entry) for axis in (1, 2))
+        row = place // deep
+        first = row // across
+        step = (first, row - first * across, place - row * deep)
         # A cell that the face's plane does not reach is within the box only.
         normal = torch.nn.functional.normalize(
             torch.linalg.cross(piece[:, 1] - piece[:, 0], piece[:, 2] - piece[:, 0]), dim=1
         )
-        center = low + (cell + 0.5) * size
-        off = ((center - piece[entry, 0]) * normal[entry]).sum(1).abs()
-        kept = off <= reach + size / 2 * normal.abs().sum(1)[entry]
-        index = (cell[kept, 0] * shape[1] + cell[kept, 1]) * shape[2] + cell[kept, 2]
-        pairs = torch.unique(index * len(corners) + face[entry[kept]])
+        center = low + (lowest + 0.5) * size  # of each piece's lowest cell
+        off = ((center - piece[:, 0]) * normal).sum(1).index_select(0, entry)
+        for axis in range(3):
+            off += (size * normal[:, axis]).index_select(0, entry).mul_(step[axis])
+        kept = off.abs_() <= (reach + size / 2 * normal.abs().sum(1)).index_select(0, entry)
+        lowest = (lowest[:, 0] * shape[1] + lowest[:, 1]) * shape[2] + lowest[:, 2]
+        inside = (step[0][kept] * shape[1] + step[1][kept]) * shape[2] + step[2][kept]
+        entry = entry[kept]
+        index = lowest.index_select(0, entry).add_(inside)
+        pairs = torch.unique(index * len(corners) + face.index_select(0, entry))
         index = pairs // len(corners)
         cells = shape[0] * shape[1] * shape[2]
         first = torch.searchsorted(index, torch.arange(cells + 1))

@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advtex_engine.render.filtering import window_sums
+from advtex_engine.render.filtering import halved, window_sums
 from advtex_engine.render.texture import footprints, sample_texels
 from advtex_engine.render.view_maps import ViewMaps, foregrounds
 from advtex_engine.runtime.available_memory import available_memory
@@ -111,29 +111,44 @@ def displacement(render: Tensor, photograph: Tensor, known: Tensor) -> Tensor:
     """
     octaves = [torch.stack((render, photograph, known))]
     while len(octaves) < OCTAVES and min(octaves[-1].shape[1:]) >= 2 * LEAST_SIDE:
-        octaves.append(F.avg_pool2d(octaves[-1], 2))
-    moved = torch.zeros_like(octaves[-1][:2])
+        octaves.append(halved(octaves[-1]))
+    moved = torch.zeros_like(halved(octaves[-1][:2]))
     for number, planes in enumerate(reversed(octaves)):
         if number:
-            moved = F.interpolate(2 * moved[None], planes.shape[1:], mode="bilinear", align_corners=False)[0]
+            moved = _spread(2 * moved, halved(planes))
         moved = _improved(moved, planes[:2], (planes[2] > INSIDE).to(planes))
-    return moved
+    return _spread(moved, render)
 
 
 def _improved(moved: Tensor, planes: Tensor, known: Tensor) -> Tensor:
-    """A displacement [2,h,w] after ROUNDS of Gauss-Newton steps, of one octave's render and photograph [2,h,w]."""
+    """A displacement after ROUNDS of Gauss-Newton steps, of one octave's render and photograph [2,h,w], known [h,w].
+
+    moved: [2,h/2,w/2]. All pixels are compared; means over windows of them are as well known at every second.
+    """
     ours, theirs = _band(planes, known, SMOOTH - 2)
     right = F.pad((ours[:, 2:] - ours[:, :-2]) / 2, (1, 1))
     down = F.pad((ours[2:] - ours[:-2]) / 2, (0, 0, 1, 1))
-    products = _means(torch.stack((right * right, right * down, down * down)), known, REACH)
+    weight = halved(known[None])[0]
+    wide, narrow = (_inverse_sums(weight, reach // 2) for reach in (REACH, SMOOTH))
+    slopes = torch.stack((right, down)) * known
+    products = window_sums(halved(torch.cat((slopes * right, slopes[1:] * down))), REACH // 2) * wide
     across, both, along = products[0] + FAINT, products[1], products[2] + FAINT
     determinant = across * along - both * both
     for _ in range(ROUNDS):
-        off = _sampled(theirs[None], moved, "bilinear")[0] - ours
-        pull = _means(torch.stack((right * off, down * off)), known, REACH)
+        off = _sampled(theirs[None], _spread(moved, ours), "bilinear")[0] - ours
+        pull = window_sums(halved(slopes * off), REACH // 2) * wide
         step = torch.stack((along * pull[0] - both * pull[1], across * pull[1] - both * pull[0])) / determinant
-        moved = _means(moved - step.clamp(-1, 1), known, SMOOTH)
+        moved = window_sums((moved - step.clamp(-1, 1)) * weight, SMOOTH // 2) * narrow
     return moved
+
+
+def _spread(moved: Tensor, picture: Tensor) -> Tensor:
+    """A displacement [2,...] at every pixel of a picture [...,h,w]."""
+    return F.interpolate(moved[None], picture.shape[-2:], mode="bilinear", align_corners=False)[0]
+
+
+def _inverse_sums(known: Tensor, reach: int) -> Tensor:
+    return window_sums(known[None], reach)[0].clamp(min=1).reciprocal()
 
 
 def _correlation(ours: Tensor, theirs: Tensor, known: Tensor) -> Tensor:

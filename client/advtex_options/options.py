@@ -28,7 +28,7 @@ UNSEEN_HELP = MappingProxyType(
         "remove": "its faces are left out of the model",
     }
 )
-FACE_BUDGET = 80_000
+FACE_BUDGET = 100_000
 MAX_VIEWS = 240
 
 T = TypeVar("T")

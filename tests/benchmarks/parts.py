@@ -50,6 +50,7 @@ from advtex_engine.core.config import TextureConfig, resolve_preset
 from advtex_engine.methods import MethodInput
 from advtex_engine.metrics.lpips import Lpips
 from advtex_engine.runtime.devices import choose_device
+from advtex_options.options import FACE_BUDGET
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,7 +108,7 @@ VARIANTS = {
     "without feature matching": Variant(changes={"feature_weight": 0.0}),
 }
 SHOWN = ("mean", "view selection", "the whole")
-HOLDOUT, SCAN_FACES = 8, 80_000  # of scans of one's own
+HOLDOUT, SCAN_FACES = 8, FACE_BUDGET  # of scans of one's own
 
 
 def arguments_of(line: list[str] | None = None) -> argparse.Namespace:

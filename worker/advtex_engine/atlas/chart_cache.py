@@ -41,7 +41,7 @@ from advtex_engine.runtime.files import write_atomically
 Position = npt.NDArray[np.float32]
 
 LEAST_FACES = 20_000  # fewer are charted in about a second, which neither a child nor a file is worth
-MAX_BYTES = 256 << 20  # of all files: 70 meshes of 80,000 faces
+MAX_BYTES = 256 << 20  # of all files: 56 meshes of 100,000 faces
 FORMAT = 1  # of a file: the digest of what follows, and arrays as NumPy packs them
 DIGEST = 32  # bytes
 

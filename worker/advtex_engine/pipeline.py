@@ -36,7 +36,7 @@ from advtex_engine.results import (
     write_smaller,
     write_tiles,
 )
-from advtex_engine.runtime import Stages, WorkFolder, choose_device
+from advtex_engine.runtime import Stages, WorkFolder, choose_device, threads_fitted
 from advtex_engine.stages import (
     MadeScene,
     baked_normals,
@@ -81,7 +81,8 @@ def texture_scan(
         folder.clear()
     out.mkdir(parents=True, exist_ok=True)
     budget = Budget(device, config, folder, keeper)
-    return budget.run(lambda: _run(scan, out, budget))
+    with threads_fitted():
+        return budget.run(lambda: _run(scan, out, budget))
 
 
 def _run(scan: Path, out: Path, budget: Budget) -> RunResult:

@@ -29,6 +29,7 @@ from advtex_engine.render.sharpness import shows_areas
 from advtex_engine.render.streaming import PairViews, pair_views
 from advtex_engine.render.view_maps import ViewMaps
 from advtex_engine.runtime.checkpoint import Checkpoints
+from advtex_engine.runtime.threads import fit_threads
 from advtex_engine.selection.shared_detail import OPTIMIZED, share_detail
 
 NEEDED = ("level", "step", "losses", "quality", "halved", "probed", "optimizer", "views", "probes")
@@ -229,6 +230,7 @@ def _run_level(
     if probes is not None:
         probes.reached(run.step, optimizer.result)
     while run.step < end and not (probes is not None and probes.over):
+        fit_threads()
         before = run.step
         run.step += stepper.take((end if probes is None else min(end, probes.next)) - run.step)
         views.advance(run.step - before)

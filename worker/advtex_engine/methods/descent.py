@@ -14,6 +14,7 @@ from advtex_engine.methods.mean import dense_texture
 from advtex_engine.render.streaming import PairViews
 from advtex_engine.render.view_maps import ViewMaps, foregrounds
 from advtex_engine.runtime.checkpoint import Checkpoints, restore_generator
+from advtex_engine.runtime.threads import fit_threads
 
 LR = 1e-3
 """Learning rate of the first step, in colors of [0, 1], from the mean. It falls to zero in a straight line, so that the
@@ -58,6 +59,7 @@ def descend(
             views.load_state_dict(saved["views"])
     every = max(1, steps // HISTORY_POINTS)
     for step in range(first, steps):
+        fit_threads()
         adam.param_groups[0]["lr"] = rate * (1 - step / steps)
         value = loss(values, step)
         (values.grad,) = torch.autograd.grad(value, [values])

@@ -40,6 +40,7 @@ from advtex_engine.refine.points import (
 from advtex_engine.refine.pose import ROBUST_SCALE, local_contrast, sample_points
 from advtex_engine.refine.solve import residuals, weighted_mean
 from advtex_engine.refine.working_views import CHECKED_SHARE, CONTRAST_SCALE, luminance, working_color
+from advtex_engine.runtime.threads import fit_threads
 
 LEVELS = ((4, 3), (2, 3), (1, 3))  # shrink factor of the image, Gauss-Newton steps
 POINTS_PER_VIEW = 20_000
@@ -91,6 +92,7 @@ def refine_geometry(scene: Scene, device: torch.device, seed: int) -> GeometryRe
             break
         features = local_contrast(luminance(color), scale)
         for _ in range(steps):
+            fit_threads()
             offsets = given.step(offsets, features, seen, scale)
         taken, report = given.judged(given.moved(offsets), first)
         before, after = report["residual_before"], report["residual_after"]

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from advtex_engine.refine.points import Observations
+from advtex_engine.runtime.threads import fit_threads
 
 # After so many the solution is within .3 % of the exact one on every scan tried (.03 % in the median); what calls this
 # begins anew from it anyway.
@@ -87,6 +88,7 @@ def solve_views(
 
     jacobian: [V,Q,K]; residual and weight: [V,K]. prior and offset: [V,Q], adding prior * (x + offset)^2; prior > 0.
     """
+    fit_threads()
     weighted = jacobian * weight[:, None]
     blocks = weighted @ jacobian.mT + torch.diag_embed(prior)
     if anchor is not None:

@@ -16,6 +16,7 @@ from advtex_engine.core.config import Preset, TextureConfig
 from advtex_engine.core.scene import Atlas, Scene
 from advtex_engine.metrics.evaluate import configured_lpips, score_views
 from advtex_engine.runtime.files import json_text, write_atomically
+from advtex_engine.runtime.threads import thread_limit
 
 
 def versions() -> dict[str, str]:
@@ -78,7 +79,7 @@ def assembled(
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
     return {
         "versions": versions(),
-        "device": f"{device.type} ({name}, {torch.get_num_threads()} threads)",
+        "device": f"{device.type} ({name}, {thread_limit()} threads)",
         "options": asdict(config),
         "preset": asdict(preset),
         "warnings": warnings,

@@ -12,10 +12,16 @@ if TYPE_CHECKING:
     from advtex_engine.runtime.checkpoint import WorkFolder
     from advtex_engine.runtime.devices import choose_device
     from advtex_engine.runtime.stage_records import Stages
+    from advtex_engine.runtime.threads import threads_fitted
 
-__all__ = ["Stages", "WorkFolder", "choose_device"]
+__all__ = ["Stages", "WorkFolder", "choose_device", "threads_fitted"]
 
-_MODULES = {"Stages": "stage_records", "WorkFolder": "checkpoint", "choose_device": "devices"}
+_MODULES = {
+    "Stages": "stage_records",
+    "WorkFolder": "checkpoint",
+    "choose_device": "devices",
+    "threads_fitted": "threads",
+}
 
 
 def __getattr__(name: str) -> object:

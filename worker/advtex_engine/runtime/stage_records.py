@@ -15,6 +15,7 @@ import torch
 from advtex_engine.core.errors import Stopped
 from advtex_engine.core.monitor import WarningKeeper
 from advtex_engine.runtime.checkpoint import WorkFolder
+from advtex_engine.runtime.threads import fit_threads
 
 RESET_PEAK = "5"  # written to clear_refs, it sets VmHWM back to the present resident set: proc(5)
 
@@ -60,6 +61,7 @@ class Stages:
         """Raises Stopped before the stage when a stop was asked for: what earlier stages made is in the work folder."""
         if self.monitor.stop_requested():
             raise Stopped(f"stopped before {stage}; resume goes on from there")
+        fit_threads()
         self.monitor.stage_started(stage)
         reset_peak_memory(self.device)
         started = time.monotonic()

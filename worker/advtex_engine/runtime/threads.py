@@ -1,17 +1,26 @@
-"""Work on many items in a few threads, read ahead by no more than is worked on."""
+"""Work on many items in a few threads, read ahead by no more than is worked on; how many threads operations take."""
 
 from __future__ import annotations
 
 import os
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TypeVar
 
 import torch
 
 WORKERS = 16  # an image of 12 megapixels takes 70 MB while it is decoded
+BUSY_FIELDS = (1, 2, 3, 6, 7, 8)  # of a core in /proc/stat: user, nice, system, irq, softirq, steal
+STAT = Path("/proc/stat")
+WINDOW_SECONDS = 1.0  # over which load is measured, at least
+# Of a core that others may use before it counts as taken. With one of two cores taken, a run of two threads takes 1.6
+# times as long as one of a single thread: each operation waits for the thread whose turn it is not.
+TOLERATED = 0.25
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -44,3 +53,70 @@ def one_thread_each() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+@dataclass
+class _Load:
+    """What was measured last. limit: threads without any load. busy, own: seconds of all processes, of this one."""
+
+    limit: int
+    at: float
+    busy: float
+    own: float
+
+
+_load: _Load | None = None
+
+
+@contextmanager
+def threads_fitted() -> Iterator[None]:
+    """Within it `fit_threads` decides how many threads PyTorch's operations take; afterwards they take what they took.
+
+    Without effect where the system does not tell how busy its cores are.
+    """
+    global _load  # as PyTorch's own number of threads is
+    limit, busy = torch.get_num_threads(), _busy_seconds()
+    if busy is None:
+        yield
+        return
+    _load = _Load(limit, time.monotonic(), busy, time.process_time())
+    try:
+        yield
+    finally:
+        _load = None
+        torch.set_num_threads(limit)
+
+
+def fit_threads() -> None:
+    """To be called between operations, however often: leaves cores that other processes use to these."""
+    if _load is None or (passed := time.monotonic() - _load.at) < WINDOW_SECONDS or (busy := _busy_seconds()) is None:
+        return
+    own = time.process_time()
+    others = (busy - _load.busy - (own - _load.own)) / passed
+    torch.set_num_threads(fitting_threads(_load.limit, len(_cores()), others))
+    _load.at, _load.busy, _load.own = time.monotonic(), busy, own
+
+
+def fitting_threads(limit: int, cores: int, others: float) -> int:
+    """How many of at most `limit` threads run at once on `cores` of which other processes use `others`."""
+    return max(1, min(limit, int(cores - others + TOLERATED)))
+
+
+def thread_limit() -> int:
+    """Threads that PyTorch's operations take where other processes leave all cores."""
+    return torch.get_num_threads() if _load is None else _load.limit
+
+
+def _busy_seconds() -> float | None:
+    """Of the cores that this process may use, since the system's start; None where there is no /proc/stat."""
+    names = {f"cpu{core}" for core in _cores()}
+    try:
+        lines = [line.split() for line in STAT.read_text().splitlines()]
+    except OSError:
+        return None
+    ticks = sum(int(line[field]) for line in lines if line and line[0] in names for field in BUSY_FIELDS)
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+def _cores() -> set[int]:
+    return os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(os.cpu_count() or 1))

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from advtex_engine.core.scene import Atlas, Camera, Mesh
@@ -105,8 +104,14 @@ def _heights(corners: Tensor) -> Tensor:
 def _grow(face: Tensor, steps: int) -> Tensor:
     """Empty texels (-1) of [H,W] take a face of their eight neighbors, `steps` times; the highest index wins."""
     for _ in range(steps):
-        # float32 would round indices above 2^24.
-        around = F.max_pool2d(face[None].double(), 3, 1, 1)[0].to(face.dtype)
+        around = face
+        for axis in (0, 1):  # max_pool2d, of doubles for the sake of large indices, takes a CPU three times as long
+            count = face.shape[axis] - 1
+            here, there = around.clone(), around
+            for first, second in ((0, 1), (1, 0)):
+                side = here.narrow(axis, first, count)
+                torch.maximum(side, there.narrow(axis, second, count), out=side)
+            around = here
         face = torch.where(face >= 0, face, around)
     return face
 

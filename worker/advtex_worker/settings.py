@@ -30,7 +30,9 @@ class WorkerSettings(StoreSettings):
     cache_bytes: int | None = Field(
         default=None, ge=0, description="of scans that are kept; by default 20 GiB, and none where blobs are a folder"
     )
-    threads: int = Field(default_factory=lambda: len(os.sched_getaffinity(0)), ge=1, description="of the engine")
+    threads: int = Field(
+        default_factory=lambda: len(os.sched_getaffinity(0)), ge=1, description="of the engine, at most"
+    )
     grace_seconds: float = Field(default=30.0, gt=0, description="a runner that was asked to stop is killed after this")
     refused_seconds: float = Field(
         default=600.0, ge=0, description="a job ends after the storage has refused it for so long: no right, no bucket"

@@ -13,6 +13,7 @@ from advtex_engine.core.cameras import project, unproject
 from advtex_engine.core.scene import Camera, Mesh, Scene, View
 from advtex_engine.refine.rig import Device
 from advtex_engine.refine.run import (
+    DEVICE_MARGIN,
     Refinement,
     apply_refinement,
     refine_cameras,
@@ -152,6 +153,22 @@ def test_a_right_camera_is_left_alone(true_scene: Scene) -> None:
     assert not refinement.report["device"]["corrected"]
     assert apply_refinement(true_scene, refinement).heldout is true_scene.heldout
     assert refinement.lens is None
+
+
+def test_poses_that_drift_are_no_device(true_scene: Scene) -> None:
+    """Half of the cameras 3 cm aside: a device halfway explains much of it, poses alone all."""
+    offset = torch.eye(4, dtype=torch.float64)
+    offset[0, 3] = -0.03
+    views = [
+        replace(view, camera=replace(view.camera, world_to_camera=offset @ view.camera.world_to_camera))
+        for view in true_scene.views[:5]
+    ]
+    refinement = refine_cameras(replace(true_scene, views=(*views, *true_scene.views[5:])), CPU, 0)
+    described, mean = refinement.report["device"], refinement.report["mean"]
+    assert described["residual_after"] < DEVICE_MARGIN * described["residual_before"]
+    assert not described["corrected"]
+    assert refinement.lens is None
+    assert mean["residual_after"] < described["residual_after"]
 
 
 def test_the_same_correction_at_another_image_size() -> None:

@@ -101,36 +101,34 @@ def refine_cameras(scene: Scene, device: torch.device, seed: int, shared: bool =
     """
     came = scene
     scene, by_depth = _registered(scene, device)
-    working = working_views(scene.mesh, scene.views, scene.kind, device, seed)
-    if working is None:
+    given = torch.stack([view.camera.world_to_camera for view in came.views]).to(device, torch.float64)
+    placed = _placed(scene, given, device, seed)
+    if placed is None:
         return _unmoved(came)
-    given = torch.stack([view.camera.world_to_camera for view in came.views]).to(working.given)
-    camera = scene.views[0].camera
-    scale = (camera.width / working.size[0], camera.height / working.size[1])
-    found, poses = _poses(working, given)
+    camera, size = scene.views[0].camera, placed.working.size
+    scale = (camera.width / size[0], camera.height / size[1])
     distortion, common = None, None
     described = dict[str, Any]()
     if shared:
-        distortion, described["distortion"] = refine_distortion(working, found)
+        distortion, described["distortion"] = refine_distortion(placed.working, placed.poses)
         if distortion is not None:
-            scene = replace(scene, views=_straightened(scene.views, distortion))
-            working = working_views(scene.mesh, scene.views, scene.kind, device, seed)
-            if working is None:
+            placed = _placed(replace(scene, views=_straightened(scene.views, distortion)), given, device, seed)
+            if placed is None:
                 return _unmoved(came)
-        common, described["device"] = _device(working)
+        common, described["device"] = _device(placed.working)
         if common is not None:
-            common = common.at_scale(*scale)
-            scene = replace(scene, views=tuple(_on_device(view, common) for view in scene.views))
-            described["device"] |= _describe(common, scene.views[0].camera)
-            given = common.offset.to(given) @ given
-            working = working_views(scene.mesh, scene.views, scene.kind, device, seed)
-            if working is None:
-                return _unmoved(came)
-        if distortion is not None or common is not None:
-            found, poses = _poses(working, given)
+            full = common.at_scale(*scale)
+            views = tuple(_on_device(view, full) for view in placed.scene.views)
+            other = _placed(replace(scene, views=views), common.offset.to(given) @ given, device, seed)
+            if other is not None and _agrees_better(other, placed, common):
+                placed, common = other, full
+                described["device"] |= _describe(full, views[0].camera)
+            else:
+                common, described["device"]["corrected"] = None, False
+    scene, working, given, found = placed.scene, placed.working, placed.given, placed.poses
     gain, offset, exposures = _exposures(working, found)
     moved = motion(found, replace(working, given=given)) * torch.tensor([1.0, 1.0, scale[0]])
-    columns = {**poses, "by_depth": by_depth, **exposures, "gain": gain, "offset": offset}
+    columns = {**placed.columns, "by_depth": by_depth, **exposures, "gain": gain, "offset": offset}
     columns |= {key: moved[:, row] for row, key in enumerate(("moved_mm", "turned_degrees", "moved_pixels"))}
     frames = [
         {"name": view.name, **{key: _plain(values[row]) for key, values in columns.items()}}
@@ -234,6 +232,36 @@ def _registered(scene: Scene, device: torch.device) -> tuple[Scene, Tensor]:
     views = tuple(in_threads(registered, scene.views, workers))
     moved = [new is not old for new, old in zip(views, scene.views, strict=True)]
     return replace(scene, views=views), torch.tensor(moved)
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """A scene and the poses [V,4,4] that were found for it, beginning at `given`; columns [V] for the report."""
+
+    scene: Scene
+    working: WorkingViews
+    given: Tensor
+    poses: Tensor
+    columns: dict[str, Tensor]
+
+
+def _placed(scene: Scene, given: Tensor, device: torch.device, seed: int) -> _Placed | None:
+    """None where too few views share anything."""
+    working = working_views(scene.mesh, scene.views, scene.kind, device, seed)
+    return None if working is None else _Placed(scene, working, given, *_poses(working, given))
+
+
+def _agrees_better(other: _Placed, placed: _Placed, common: Device) -> bool:
+    """Whether views on a device, at the working size, agree better than without it when both have found their poses.
+
+    Poses that drift look as a device that is a little off: what they make up for by themselves is theirs.
+    """
+    working = placed.working
+    checked, features = working.checked, working.features
+    before = sample_points(features, working.K, placed.poses, checked, working.size)
+    after = sample_points(features, common.lens @ working.K, other.poses, checked, working.size)
+    values = before.value[..., None], after.value[..., None]
+    return better(*values, before.valid & after.valid, checked, working.checked_cell, CONTRAST_SCALE)
 
 
 def _poses(working: WorkingViews, given: Tensor) -> tuple[Tensor, dict[str, Tensor]]:

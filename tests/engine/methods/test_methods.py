@@ -29,6 +29,7 @@ from advtex_engine.methods.gabor import BLOCK, PASSES
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.sharpest import sharpness
 from advtex_engine.methods.vgg import WEIGHTS_VARIABLE, load_vgg
+from advtex_engine.methods.view_selection import select_views
 from advtex_engine.metrics.lpips import NETWORKS, WeightsError, load_features
 from advtex_engine.pipeline import texture_scan
 from advtex_engine.previews.live import Live
@@ -146,6 +147,21 @@ def test_view_selection_tells_where_it_shows_a_photograph_and_where_it_filled(tm
     assert 0.1 < known.float().mean() < 0.9
     assert (found - texture)[known & touched].abs().quantile(0.99) < 0.05
     assert (touched & ~known).any(), "what is filled counts as a guess, though a view touches it"
+
+
+def test_a_wall_of_two_faces_shows_what_photographs_from_close_by_show_of_it(tmp_path: Path) -> None:
+    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    atlas, texture = Atlas(Mesh(corners, faces, corners[:, :2].clone(), faces), SIDE, SIDE, "scan", 1), truth()
+    far = view("far", atlas, texture, camera((0.5, 0.45, 1.6)))
+    near = [
+        view(f"{x} {y}", atlas, texture, camera((x, y - 0.01, 0.6), (x, y, 0)))
+        for x in (0.3, 0.7)
+        for y in (0.31, 0.69)
+    ]
+    fine = replace(atlas, width=4 * SIDE, height=4 * SIDE)
+    selection = select_views(task(fine, (far, *near), tmp_path))
+    assert (selection.painted > 0).float().mean() > 0.7
 
 
 def test_a_face_goes_to_the_view_that_shows_it_on_most_pixels(around: MethodInput) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from advtex_engine.mesh.split import split_long_sides
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.render.texels import map_texels
 from advtex_engine.render.texture import fill_holes
@@ -19,6 +20,8 @@ from advtex_engine.selection.leveling import Sampler, blend_texels
 from advtex_engine.selection.mrf import assign_views
 from advtex_engine.selection.shared_detail import share_detail
 from advtex_engine.selection.tones import shared_tones
+
+LONGEST_SIDE = 32.0  # texels
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,7 @@ def view_selection(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
 
 def select_views(given: MethodInput) -> Selection:
     """One view per face, from the views at working size, leveled, with the detail they share. Not differentiable."""
-    atlas, maps = given.atlas, given.maps[1]
+    atlas, maps = split_long_sides(given.atlas, LONGEST_SIDE), given.maps[1]
     mesh = atlas.mesh
     # What is hidden by less than this counts as seen.
     tolerance = DEPTH_TOLERANCE[given.scene.kind] * OCCLUSION_SHARE

@@ -82,6 +82,9 @@ SELECTION, REFINE = "advtex_engine.selection", "advtex_engine.refine"
 VARIANTS = {
     "mean": Variant("mean"),
     "view selection": Variant("view_selection"),
+    "view selection with whole faces": Variant(
+        "view_selection", code={"advtex_engine.methods.view_selection.LONGEST_SIDE": 1e6}
+    ),
     "view selection without regional blur": Variant("view_selection", code={f"{SELECTION}.detail.WEIGHT": 0.0}),
     "view selection without agreement": Variant(
         "view_selection", code={f"{SELECTION}.candidates.AGREEMENT_WEIGHT": 0.0}
@@ -108,12 +111,13 @@ VARIANTS = {
     "without feature matching": Variant(changes={"feature_weight": 0.0}),
 }
 SHOWN = ("mean", "view selection", "the whole")
-HOLDOUT, SCAN_FACES = 8, FACE_BUDGET  # of scans of one's own
+HOLDOUT = 8  # of scans of one's own
 
 
 def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
     parser = common_arguments("parts", __doc__)
     parser.add_argument("scans", nargs="*", type=Path, help="folders or zip files")
+    parser.add_argument("--scan-faces", type=int, default=FACE_BUDGET, help="of scans, most faces of their meshes")
     parser.add_argument("--synthetic", nargs="*", default=list(SCANS), choices=SCANS)
     parser.add_argument("--models", type=int, default=2, help="objects, with other prints each")
     parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=VARIANTS, metavar="NAME")
@@ -129,7 +133,7 @@ def settings_of(arguments: argparse.Namespace, synthetic: str, model: int, varia
 
 def scan_settings_of(arguments: argparse.Namespace, scan: Path, variant: str) -> dict[str, Any]:
     """What a cell of a real scan is found by."""
-    shared = {name: getattr(arguments, name) for name in ("size", "steps", "preset")}
+    shared = {name: getattr(arguments, name) for name in ("size", "steps", "preset", "scan_faces")}
     return {"scan": scan.stem, "variant": variant, **shared}
 
 
@@ -166,7 +170,7 @@ def fill_scans(arguments: argparse.Namespace, results: Results) -> None:
             size=parsed_size(arguments.size),
             holdout=HOLDOUT,
             steps=arguments.steps,
-            face_budget=SCAN_FACES,
+            face_budget=arguments.scan_faces,
             device=arguments.device,
         )
         with tempfile.TemporaryDirectory(prefix="advtex-parts-") as folder:

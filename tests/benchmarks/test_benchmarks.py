@@ -156,8 +156,11 @@ def test_what_is_learned_elsewhere_is_asked_of_a_scan_that_was_not_seen(
     cells = json.loads((tmp_path / "out" / "learning.json").read_text())["cells"]
     assert [cell["settings"]["learned_on"] for cell in cells] == ["room shelf", "desk room", "desk shelf"]
     assert all(0.3 < cell["scores"]["accuracy 1"] < 0.7 for cell in cells)
-    # Few steps leave all logits on one side of 0, where half are right whatever they are; about their mean it shows.
-    assert all((cell["scores"][learning.CENTERED] > 0.5) == (cell["scores"]["margin 1"] > 0) for cell in cells)
+    # Few steps leave all logits on one side of 0, where half are right whatever they are; about their mean it shows,
+    # where the means of real and false logits are a tenth of their spread apart.
+    clear = [scores for cell in cells if abs((scores := cell["scores"])["margin 1"]) > 0.1 * scores["spread 1"]]
+    assert clear
+    assert all((scores[learning.CENTERED] > 0.5) == (scores["margin 1"] > 0) for scores in clear)
     centered, as_it_is = (
         sum(abs(cell["scores"][name] - 0.5) for cell in cells) for name in (learning.CENTERED, "accuracy 1")
     )
@@ -281,11 +284,10 @@ def test_each_part_is_switched_off_once(
     small_desk: Path, tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(parts, "HOLDOUT", 3)
-    monkeypatch.setattr(parts, "SCAN_FACES", 600)
     some = (*parts.SHOWN, "view selection without a lens")
     monkeypatch.setattr(parts, "VARIANTS", {name: parts.VARIANTS[name] for name in some})
     line = [str(small_desk), *SMALL, "--synthetic", "geometry", "--models", "1", "--lpips-weights", str(weights)]
-    line += ["--results", str(tmp_path)]
+    line += ["--results", str(tmp_path), "--scan-faces", "600"]
     parts.main(line)
     page = (tmp_path / "parts.md").read_text()
     assert all(page.count(f"| {variant} |") == 2 for variant in parts.VARIANTS)

@@ -19,7 +19,7 @@ TEXELS_PER_VIEW_PIXEL = 0.5  # views overlap: 0.13 to 0.38 were measured
 PER_TEXEL = 200
 PER_STEP_PIXEL = 2048  # activations of the discriminator and what is rendered
 PER_SCORED_PIXEL = 4096  # LPIPS of held-out views
-STANDARD_STEP_PIXELS = 384 * 288  # that preset sees larger views in parts
+STANDARD_STEP_PIXELS = 640 * 480  # that preset sees larger views in parts
 MAX_VIEW_BYTES = 8 * GIB  # the engine chooses fewer views where theirs would be more
 MAX_SCORED_VIEWS = 50  # kept beside them
 # Of a mesh that is fused from depth, before it is decimated: 62 frames of a kitchen took 0.95 GiB. The engine caps its

@@ -37,6 +37,7 @@ from advtex_engine.mesh.clean import clean, decimate
 from advtex_engine.mesh.models import load_model
 from advtex_engine.methods import MethodInput, texture_function
 from advtex_engine.methods.adversarial import starting_texture
+from advtex_engine.methods.gabor import descended
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.view_selection import select_views
 from advtex_engine.metrics.evaluate import PATCH_METRICS, VIEW_METRICS, Comparison, evaluate, score
@@ -149,6 +150,9 @@ def run_method(given: MethodInput, method: str) -> Tensor:
         given = started(dataclasses.replace(given, preset=preset))
     elif record.plays_game:
         given = started(given)
+        if given.preset.start == "selection" and given.preset.passes:
+            start, _ = descended(given, passes=given.preset.passes, checkpoint="descent")
+            given = dataclasses.replace(given, start=start)
     given = dataclasses.replace(given, config=dataclasses.replace(given.config, method=method))
     texture, _ = texture_function(method)(given)
     return completed(given, texture)

@@ -51,6 +51,10 @@ class Recorder(Monitor):
         self.files: set[str] = set()
         self.problems: list[Problem] = []
         self.glimpses: list[Glimpse] = []
+        self.stage = ""
+
+    def stage_started(self, stage: str) -> None:
+        self.stage = stage
 
     def stage_finished(
         self, stage: str, seconds: float, peak_memory_bytes: int, peak_device_memory_bytes: int | None
@@ -61,6 +65,8 @@ class Recorder(Monitor):
         self.seconds[stage] = seconds
 
     def progress(self, step: int, steps: int, losses: Mapping[str, float]) -> None:
+        if self.stage != "optimization":
+            return
         assert steps == STEPS
         self.steps.append(step)
         self.step = step
@@ -184,6 +190,36 @@ def test_a_stopped_run_resumes_to_the_same_bytes_without_redoing_earlier_stages(
     assert (report["losses"], report["game"]) == (unbroken["losses"], unbroken["game"])
 
 
+class StopsEarly(Recorder):
+    """Stops in the steps that the start is made by."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.started = 0
+
+    def progress(self, step: int, steps: int, losses: Mapping[str, float]) -> None:
+        super().progress(step, steps, losses)
+        self.started += self.stage == "initial_texture"
+
+    def stop_requested(self) -> bool:
+        return self.started > 0
+
+
+def test_a_run_that_is_stopped_before_its_game_resumes_to_the_same_bytes(
+    scan: Path, whole: tuple[Path, Recorder], tmp_path: Path
+) -> None:
+    with pytest.raises(Stopped, match="step 1 of"):
+        texture_scan(scan, tmp_path, CONFIG, work=tmp_path / "work", monitor=StopsEarly())
+    assert not (tmp_path / "work" / "descended.pt").exists()
+    again = Recorder()
+    texture_scan(scan, tmp_path, CONFIG, work=tmp_path / "work", resume=True, monitor=again)
+    assert again.steps == list(range(1, STEPS + 1))
+    assert filecmp.cmp(tmp_path / "model.png", whole[0] / "model.png", shallow=False)
+    report = json.loads((tmp_path / "report.json").read_text())
+    (optimization,) = [stage["seconds"] for stage in report["stages"] if stage["stage"] == "optimization"]
+    assert optimization == pytest.approx(again.seconds["optimization"], abs=0.002)
+
+
 def test_without_resume_and_with_other_options_the_work_folder_is_not_used(scan: Path, tmp_path: Path) -> None:
     config = replace(CONFIG, refine=False)
     with pytest.raises(Stopped):
@@ -223,12 +259,16 @@ def test_a_killed_run_resumes_bit_identical(scan: Path, tmp_path: Path) -> None:
 
 
 class Resumed(Monitor):
-    """Remembers where it began."""
+    """Remembers where the optimization began."""
 
-    first_step = 0
+    first_step, stage = 0, ""
+
+    def stage_started(self, stage: str) -> None:
+        self.stage = stage
 
     def progress(self, step: int, steps: int, losses: Mapping[str, float]) -> None:
-        self.first_step = self.first_step or step
+        if self.stage == "optimization":
+            self.first_step = self.first_step or step
 
 
 @pytest.mark.slow
@@ -255,7 +295,7 @@ def test_a_terminated_run_leaves_a_checkpoint_and_its_exit_code_says_so(scan: Pa
     assert child.returncode == 130
     assert "resume goes on from there" in errors
     assert time.monotonic() - started < 10
-    assert (tmp_path / "work" / "checkpoint.pt").exists()
+    assert (tmp_path / "work" / "descent.pt").exists(), "of the passes that come before the game"
 
 
 @pytest.mark.slow

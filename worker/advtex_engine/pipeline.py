@@ -97,7 +97,6 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
         atlas, work = fitting_atlas(scene, budget, stages, charts)
     maps, work = fitting_view_maps(scene, atlas, work, budget, stages)
     given = method_input(scene, atlas, maps, work, budget, stages)
-    budget.begin(given.held_bytes)
     with stages.run("optimization"):
         texture, losses = texture_function(config.method)(given)
         budget.folder.earlier_seconds = given.work.earlier_seconds

@@ -37,8 +37,14 @@ class Listener(Monitor):
         self.stop_at, self.step = stop_at, 0
         self.notes, self.problems = list[str](), list[Problem]()
         self.steps = list[int]()
+        self.stage = ""
+
+    def stage_started(self, stage: str) -> None:
+        self.stage = stage
 
     def progress(self, step: int, steps: int, losses: Any) -> None:
+        if self.stage != "optimization":
+            return
         self.step = step
         self.steps.append(step)
 
@@ -97,12 +103,13 @@ def test_what_the_device_holds_of_it_already_counts_as_free(tmp_path: Path, monk
 
 
 def test_then_the_crop_then_the_texture_and_then_it_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    small = replace(WORK, preset=replace(WORK.preset, max_crop=(192, 144)))
+    small = replace(WORK, preset=replace(WORK.preset, max_crop=(192, 144), descent_crop=(192, 144)))
     has(monkeypatch, int(needed(small, LEAST_VIEWS) / 0.895))
     given = budget(tmp_path)
     assert not given.fit(WORK, "atlas")
     assert given.limits == Limits(on_device=LEAST_VIEWS, max_crop=(192, 144))
-    assert given.preset(WORK.preset).max_crop == (192, 144)
+    preset = given.preset(WORK.preset)
+    assert preset.max_crop == preset.descent_crop == (192, 144)
     has(monkeypatch, int(needed(small, LEAST_VIEWS) * 0.6))
     assert given.fit(WORK, "atlas"), "the atlas must be made anew"
     assert given.limits.texture == given.texture_config().max_texture_size == 2048

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,8 +22,8 @@ from torch.profiler import ProfilerActivity, profile
 from advtex_contract.options import JobOptions
 from advtex_contract.options import Preset as Presets
 from advtex_engine.adversarial.discriminator import PatchDiscriminator
-from advtex_engine.adversarial.optimizer import AdversarialOptimizer
-from advtex_engine.budget.workload import PARAMETERS, Workload, activations, estimate, tensor_bytes
+from advtex_engine.adversarial.optimizer import AdversarialOptimizer, crop_size
+from advtex_engine.budget.workload import PARAMETERS, Workload, activations, estimate, fullest, tensor_bytes
 from advtex_engine.core.config import PRESETS, Preset
 from advtex_engine.render.view_maps import ViewMaps, held_bytes
 from advtex_engine.runtime import available_memory as memory
@@ -190,7 +192,7 @@ def test_the_service_never_asks_for_less_than_the_engine_needs(
     work = Workload(
         views, width, height, (side, side), slots, "adversarial", PRESETS[preset], device, bfloat16=device == "cuda"
     )
-    assert needed_memory(options, views, width, height) >= sum(estimate(work).values())
+    assert needed_memory(options, views, width, height) >= sum(fullest(work).values())
 
 
 def memory_views(width: int, height: int) -> int:
@@ -205,6 +207,14 @@ def test_a_scannet_scene_fits_a_card_of_24_gb() -> None:
     assert sum(estimate(work).values()) < 0.9 * 24e9
     half = sum(estimate(work, 300).values())
     assert half < 0.9 * 8e9, "and one of 8 GB, by blocks"
+
+
+def test_the_passes_before_a_game_count_where_they_need_more() -> None:
+    work = Workload(10, 640, 480, (512, 512), 100_000, "adversarial", PRESETS["standard"], "cuda")
+    assert fullest(work)["step"] == 2400 * math.prod(crop_size(640, 480))
+    narrow = replace(work, preset=replace(work.preset, descent_crop=(96, 64)))
+    assert fullest(narrow) == estimate(narrow) == estimate(work)
+    assert fullest(replace(work, preset=PRESETS["paper"])) == estimate(replace(work, preset=PRESETS["paper"]))
 
 
 @pytest.mark.parametrize("method", ["mean", "best_view", "l1", "gabor", "vgg", "colormap"])

@@ -20,7 +20,7 @@ from advtex_engine.adversarial.disagreement import disagreement
 from advtex_engine.adversarial.discriminator import PatchDiscriminator
 from advtex_engine.adversarial.optimizer import AdversarialOptimizer, crop_size
 from advtex_engine.core.config import PRINTED, PyramidLevel, TextureConfig
-from advtex_engine.core.errors import EngineError, Stopped
+from advtex_engine.core.errors import EngineError, Problem, Stopped
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Atlas, Camera, Mesh, Scene, View
 from advtex_engine.methods import LossPoint, MethodInput, descent, gabor, texture_function
@@ -342,6 +342,53 @@ def test_gabor_compares_other_windows_at_each_step(tmp_path: Path, monkeypatch: 
     gabor.gabor(replace(given, maps={1: maps}, means={1: mean_texture(maps)}))
     assert {tuple(photograph.shape) for photograph in seen} == {(1, 3, *reversed(crop_size(120, 96)))}
     assert len({float(photograph[0, 0, 0, 0]) for photograph in seen}) > 20
+
+
+class Warned(Monitor):
+    def __init__(self) -> None:
+        self.codes = list[str]()
+
+    def warning(self, problem: Problem) -> None:
+        self.codes.append(problem.code)
+
+
+@pytest.mark.parametrize("agree", [True, False])
+def test_gabor_leaves_a_start_that_other_photographs_have_nothing_to_say_about(tmp_path: Path, agree: bool) -> None:
+    """Photographs of one print that are off by two pixels, and photographs of nine prints."""
+    fine = torch.rand((9, 3, SIDE // 3, SIDE // 3), generator=torch.Generator().manual_seed(4))
+    prints = F.interpolate(fine, (SIDE, SIDE), mode="bilinear").permute(0, 2, 3, 1)
+    shifts = list(itertools.product((-2, 0, 2), repeat=2))
+    shown = [prints[0 if agree else number].roll(by, (0, 1)) for number, by in enumerate(shifts)]
+    maps = planar_maps((torch.stack(shown) * 255).round().to(torch.uint8), SIDE, SIDE)
+    monitor = Warned()
+    given = task(plane(), (view("0", plane(), truth(), camera((0.5, 0.45, 1.0))),), tmp_path, monitor=monitor, steps=9)
+    start, painted = shown[4].contiguous(), torch.full((SIDE, SIDE), 4, dtype=torch.int16)
+    given = replace(given, maps={1: maps}, means={1: mean_texture(maps)}, start=start, painted=painted)
+    texture, losses = gabor.gabor(given)
+    assert (gabor.start_unlikeness(given) > gabor.UNLIKE) != agree
+    assert torch.equal(texture, start) != agree
+    assert (monitor.codes, bool(losses)) == ([] if agree else ["photographs_disagree"], agree)
+
+
+def test_a_descent_in_crops_sees_all_of_the_views_as_often(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = list[int]()
+    loss = gabor.gabor_loss
+
+    def looked(render: Tensor, *rest: Tensor) -> Tensor:
+        seen.append(render.shape[2] * render.shape[3])
+        return loss(render, *rest)
+
+    monkeypatch.setattr(gabor, "gabor_loss", looked)
+    color = torch.randint(0, 256, (5, 96, 120, 3), generator=torch.Generator().manual_seed(2), dtype=torch.uint8)
+    given = task(plane(), (view("0", plane(), truth(), camera((0.5, 0.45, 1.0))),), tmp_path)
+    given = replace(given, maps={1: planar_maps(color, 120, 96)})
+    given = replace(given, means={1: mean_texture(given.maps[1])})
+    width, height = crop_size(120, 96)
+    for largest, checkpoint in ((None, "whole"), ((64, 72), "parts")):
+        gabor.descended(given, largest=largest, passes=2, checkpoint=checkpoint)
+        assert sum(seen) == pytest.approx(2 * 5 * width * height, rel=0.1)
+        assert set(seen) == {width * height if largest is None else 64 * 72}
+        seen.clear()
 
 
 def test_the_wide_term_is_the_difference_of_means_over_blocks() -> None:

@@ -27,9 +27,10 @@ from advtex_engine.runtime import checkpoint
 from advtex_engine.synthetic.scan import synthesize
 
 KNOWN = Path(__file__).with_name("work_format.json")
+FAULTS = ["lacks a name", "not a file of torch", "a broken pickle"]
 CONFIGS = {
-    method: TextureConfig(
-        preset="preview",
+    name: TextureConfig(
+        preset=preset,
         method=method,
         steps=6,
         size=(96, 72),
@@ -38,16 +39,23 @@ CONFIGS = {
         device="cpu",
         outputs="glb",
     )
-    for method in ("adversarial", "l1")
+    for name, method, preset in (
+        ("adversarial", "adversarial", "preview"),
+        ("standard", "adversarial", "standard"),
+        ("l1", "l1", "preview"),
+    )
 }
 
 
 class StopsAtTwo(Monitor):
     def __init__(self) -> None:
-        self.step, self.notes = 0, list[str]()
+        self.step, self.notes, self.stage = 0, list[str](), ""
+
+    def stage_started(self, stage: str) -> None:
+        self.stage = stage
 
     def progress(self, step: int, steps: int, losses: Mapping[str, float]) -> None:
-        self.step = step
+        self.step = step if self.stage == "optimization" else 0
 
     def stop_requested(self) -> bool:
         return self.step >= 2
@@ -132,16 +140,27 @@ def test_what_another_version_left_is_made_anew(stopped: Path, folder: Path, mon
 
 
 @pytest.mark.parametrize("name", ["scene", "detail", "stages", "atlas", "view_maps_1", "initial_texture", "checkpoint"])
-@pytest.mark.parametrize("fault", ["lacks a name", "not a file of torch", "a broken pickle"])
+@pytest.mark.parametrize("fault", FAULTS)
 def test_a_file_that_lacks_something_or_is_broken_is_made_anew(
     stopped: Path, folder: Path, name: str, fault: str
 ) -> None:
-    file = folder / "work" / f"{name}.pt"
+    damage(folder / "work" / f"{name}.pt", fault)
+    (note,) = [note for note in resumed(stopped, folder) if "work folder" in note]
+    assert f"{name}.pt" in note
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_so_is_what_the_passes_before_a_game_have_left(stopped: Path, tmp_path: Path, fault: str) -> None:
+    shutil.copytree(stopped / "standard", tmp_path / "work")
+    damage(tmp_path / "work" / "descended.pt", fault)
+    (note,) = [note for note in resumed(stopped, tmp_path, "standard") if "work folder" in note]
+    assert "descended.pt" in note
+
+
+def damage(file: Path, fault: str) -> None:
     if fault == "lacks a name":
         content = torch.load(file, weights_only=True)
         del content[next(key for key in content if key != "fingerprint")]
         torch.save(content, file)
     else:
         file.write_bytes((b"" if fault == "not a file of torch" else b"\x80\x02") + b"garbage" * 100)
-    (note,) = [note for note in resumed(stopped, folder) if "work folder" in note]
-    assert f"{name}.pt" in note

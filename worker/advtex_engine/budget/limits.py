@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from advtex_engine.budget.workload import Workload, estimate, tensor_bytes
+from advtex_engine.budget.workload import Workload, estimate, fullest, tensor_bytes
 from advtex_engine.core.config import Preset, TextureConfig
 from advtex_engine.core.errors import MemoryShortage, Problem
 from advtex_engine.core.monitor import WarningKeeper
@@ -87,11 +87,17 @@ class Budget:
         return torch.device("cpu") if self.limits.early_on_cpu else self.device
 
     def preset(self, preset: Preset) -> Preset:
-        """The preset, its crop no larger than what is left."""
+        """The preset, its crops no larger than what is left."""
         crop = self.limits.max_crop
-        if crop is None or preset.max_crop is None:
-            return preset if crop is None else replace(preset, max_crop=crop)
-        return replace(preset, max_crop=(min(crop[0], preset.max_crop[0]), min(crop[1], preset.max_crop[1])))
+        if crop is None:
+            return preset
+        width, height = preset.max_crop or crop
+        wide, high = preset.descent_crop
+        return replace(
+            preset,
+            max_crop=(min(crop[0], width), min(crop[1], height)),
+            descent_crop=(min(crop[0], wide), min(crop[1], high)),
+        )
 
     def texture_config(self) -> TextureConfig:
         """The options, their texture no larger than what is left."""
@@ -179,14 +185,14 @@ class Budget:
         return replace(work, preset=self.preset(work.preset))
 
     def _needed(self, work: Workload) -> int:
-        return _bytes(estimate(self._limited(work), self.limits.on_device))
+        return _bytes(fullest(self._limited(work), self.limits.on_device))
 
     def _keep_off(self, work: Workload, stage: str, room: int) -> None:
         """Leaves as many views on the device as fit there."""
         there = self.limits.on_device or work.views
         if self._needed(work) <= room or there <= LEAST_VIEWS:
             return
-        one, none = (_bytes(estimate(self._limited(work), count)) for count in (1, 0))
+        one, none = (_bytes(fullest(self._limited(work), count)) for count in (1, 0))
         fits = min(there - 1, (room - none) // (one - none))
         narrower = replace(self.limits, on_device=max(LEAST_VIEWS, fits))
         self._take(stage, self._sentence(work), narrower, self._of_views(work, narrower))

@@ -9,7 +9,7 @@ allocator, as the bytes alive at the fullest moment of a step.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from advtex_engine.adversarial.optimizer import crop_size
 from advtex_engine.adversarial.probes import CELL, CELLS
@@ -75,6 +75,11 @@ class Workload:
         return self.preset.start == "selection" if method.plays_game else method.starts_selected
 
     @property
+    def descends(self) -> bool:
+        """Whether that texture is brought nearer to the photographs before the method begins."""
+        return self.plays and self.starts_selected and self.preset.passes > 0
+
+    @property
     def toned(self) -> bool:
         """Whether the views are given the tones of the texture that the method begins with."""
         method = known_methods()[self.method]
@@ -115,6 +120,16 @@ def estimate(work: Workload, on_device: int | None = None) -> dict[str, int]:
         parts["convolutions"] = CONVOLUTIONS * work.crop[0] * work.crop[1]
         parts["libraries"] = LIBRARIES
     return parts
+
+
+def fullest(work: Workload, on_device: int | None = None) -> dict[str, int]:
+    """The estimate of the optimization, or of the passes before it where these need more."""
+    estimates = [estimate(work, on_device)]
+    if work.descends:
+        pixels = math.prod(crop_size(work.width, work.height, work.preset.descent_crop))
+        passes = estimate(replace(work, method="gabor"), on_device)
+        estimates.append(passes | {"step": known_methods()["gabor"].memory.rest * pixels})
+    return max(estimates, key=lambda parts: sum(parts.values()))
 
 
 def tensor_bytes(parts: dict[str, int]) -> int:

@@ -29,6 +29,8 @@ class Preset:
 
     levels            coarse-to-fine schedule; one level for everything but `preview`
     start             "zero" (black, as printed), "mean" (the projected mean) or "selection" (one view per face)
+    passes            over all pixels of the views, in which a start of "selection" is brought nearer to their Gabor
+                      energies before the game (`methods/gabor.py`; paper: 0)
     toned             the views' wide averages are made the start's (paper: views as photographed)
     pretraining       first steps, counted in `levels`, in which the discriminator learns alone
     lr_texture        1e-3, Adam; colors in [0, 1]. Adam's step is as long however rarely a view shows the texel and
@@ -54,6 +56,7 @@ class Preset:
     areas             the render's pixels are means over what they show, where the photographs' are; else values at
                       their middles (paper; released code)
     max_crop          largest crop (width, height) in pixels; larger views are seen in parts, for cheaper steps
+    descent_crop      the same of the passes before the game, which need 2.4 KB a pixel
     max_pair_angle    largest angle between the optical axes of a pair, degrees (released code: 15)
     min_pair_overlap  least share of the source's foreground that the auxiliary view sees
     nearest_share     of the views that remain for a source, rounded up, those whose warped images differ least from it
@@ -67,6 +70,7 @@ class Preset:
 
     levels: tuple[PyramidLevel, ...]
     start: Literal["zero", "mean", "selection"]
+    passes: float = 0.0
     toned: bool = False
     pretraining: int = 0
     lr_texture: float = 1e-3
@@ -86,6 +90,7 @@ class Preset:
     perturbation: float = 0.0
     areas: bool = False
     max_crop: tuple[int, int] | None = None
+    descent_crop: tuple[int, int] = (640, 480)
     max_pair_angle: float = 15.0
     min_pair_overlap: float = 0.3
     nearest_share: float = 1.0
@@ -135,6 +140,7 @@ PAPER = replace(
 STANDARD = Preset(
     levels=(PyramidLevel(750),),
     start="selection",
+    passes=5,
     toned=True,
     pretraining=75,
     # Twice the steps at half of it take .4 % more off the LPIPS of five scans (corrected, nothing).
@@ -169,6 +175,7 @@ PRESETS: dict[str, Preset] = {
     "preview": replace(
         STANDARD,
         levels=(PyramidLevel(800, scale=2), PyramidLevel(300)),
+        passes=0,
         pretraining=120,
         lr_texture=4e-4,
         averaging=100,
@@ -226,7 +233,10 @@ def resolve_preset(config: TextureConfig) -> Preset:
     levels = [PyramidLevel(round(level.steps * share), level.scale) for level in preset.levels]
     levels[-1] = PyramidLevel(config.steps - sum(level.steps for level in levels[:-1]), levels[-1].scale)
     pretraining, averaging, turn = (int(n * share) for n in (preset.pretraining, preset.averaging, preset.turn))
-    preset = replace(preset, levels=tuple(levels), pretraining=pretraining, averaging=averaging, turn=turn)
+    passes = preset.passes * min(1, share)
+    preset = replace(
+        preset, levels=tuple(levels), passes=passes, pretraining=pretraining, averaging=averaging, turn=turn
+    )
     if preset.start != "selection" or share <= 1:
         return preset
     return replace(preset, lr_texture=preset.lr_texture / share, lr_discriminator=preset.lr_discriminator / share)

@@ -13,7 +13,7 @@ from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.methods.mean import dense_texture
 from advtex_engine.render.streaming import PairViews
 from advtex_engine.render.view_maps import ViewMaps, foregrounds
-from advtex_engine.runtime.checkpoint import Checkpoints, restore_generator
+from advtex_engine.runtime.checkpoint import CHECKPOINT, Checkpoints, restore_generator
 from advtex_engine.runtime.threads import fit_threads
 
 LR = 1e-3
@@ -33,12 +33,14 @@ def descend(
     generator: torch.Generator,
     views: PairViews | None = None,
     rate: float | None = None,
+    checkpoint: str = CHECKPOINT,
 ) -> tuple[Tensor, list[LossPoint]]:
     """Minimizes `loss` from given.start, or else the mean -> dense texture [H,W,3] in [0,1], history of the loss.
 
     name: of the loss in the history. generator: all that `loss` draws from; its state goes into the checkpoint, so a
     run that is stopped and resumed gives the same texture. views: what `loss` draws its views from, if it draws pairs.
-    rate: Adam's at the first step, None: LR. Raises Stopped, after a checkpoint, when the monitor asks.
+    rate: Adam's at the first step, None: LR. checkpoint: the name of its file; one of another name is of what comes
+    before the method, and is not shown on the way. Raises Stopped, after a checkpoint, when the monitor asks.
     """
     maps, rate = given.maps[1], LR if rate is None else rate
     start = given.means[1] if given.start is None else given.start
@@ -46,7 +48,8 @@ def descend(
     adam = torch.optim.Adam([values], lr=rate, fused=True)
     total = torch.zeros((), device=values.device)
     first, losses = 0, list[LossPoint]()
-    checkpoints = Checkpoints(given.work, given.config.checkpoint_seconds, steps)
+    checkpoints = Checkpoints(given.work, given.config.checkpoint_seconds, steps, checkpoint)
+    shown = checkpoint == CHECKPOINT
     saved = checkpoints.load("step", "losses", "quality", "values", "total", "adam", "generator", "views")
     if saved is not None:
         first, losses = saved["step"], saved["losses"]
@@ -74,7 +77,7 @@ def descend(
                 raise Diverged(f"the loss was no longer finite at step {done} of {steps}; choose another method")
             given.monitor.progress(done, steps, {name: losses[-1][name]})
             total.zero_()
-        if done == steps or given.live.due():
+        if shown and (done == steps or given.live.due()):
             given.live.show(done, maps, values, given.means[1], losses)
         stop = given.monitor.stop_requested() and done < steps
         if stop or checkpoints.due():
@@ -86,9 +89,9 @@ def descend(
     return dense_texture(maps, values.detach()).clamp(0, 1), losses
 
 
-def drawn_views(maps: ViewMaps, steps: int | None, passes: int, generator: torch.Generator) -> list[int]:
-    """A view for each step, all that see the mesh in a new random order per pass; steps: None for whole passes."""
+def drawn_views(maps: ViewMaps, steps: int | None, passes: float, generator: torch.Generator) -> list[int]:
+    """A view for each step, all that see the mesh in a new random order per pass; steps: None for so many passes."""
     seen: list[int] = foregrounds(maps).nonzero().flatten().tolist()
-    steps = steps or passes * len(seen)
+    steps = steps or math.ceil(passes * len(seen))
     orders = [torch.randperm(len(seen), generator=generator).tolist() for _ in range(-(-steps // len(seen)))]
     return [seen[index] for order in orders for index in order][:steps]

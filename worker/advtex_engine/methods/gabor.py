@@ -6,9 +6,14 @@ nothing of colors, and nothing of what is wider than their coarsest octave: ther
 some pixels of displacement hardly change either. The render's pixels are means over what they show, where a
 photograph's are: values at their middles would make a texture that is as soft as these means, and softer still when it
 is shown. At the end half of the finest detail is that of all photographs that agree (`selection/shared_detail.py`).
+
+What forgives some pixels has nothing to say where photographs are off by many more, as with cameras that nothing could
+mend. There the texture stays as it is: photographs that it was not painted from do not look like it at all.
 """
 
 from __future__ import annotations
+
+import math
 
 import torch
 import torch.nn.functional as F
@@ -16,11 +21,15 @@ from torch import Tensor
 
 from advtex_engine.adversarial.gabor import gabor_filters, gabor_loss
 from advtex_engine.adversarial.optimizer import crop_size
+from advtex_engine.adversarial.probes import LeftOutCells
+from advtex_engine.adversarial.unlikeness import structure_unlikeness
+from advtex_engine.core.errors import Problem
 from advtex_engine.methods.descent import descend, drawn_views
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.render.sharpness import shows_areas
 from advtex_engine.render.texture import footprints, sample_texels
 from advtex_engine.render.view_maps import ViewMaps
+from advtex_engine.runtime.checkpoint import CHECKPOINT
 from advtex_engine.selection.shared_detail import OPTIMIZED, share_detail
 
 PASSES = 5  # over all views, unless the number of steps is asked for
@@ -29,17 +38,40 @@ REACH = 1e-2
 that are blurred, whatever the rate is, and edges soften; more steps take smaller ones."""
 MAX_LR = 2e-3  # larger steps leave grain
 BLOCK = 8  # pixels a side, of which means are compared; every half of it
+UNLIKE = 0.45
+"""`structure_unlikeness` of the start to photographs that it was not painted from, above which they have nothing in
+common: .08 to .35 on scans that gain by the descent, .54 to .67 where it harms (`tests/benchmarks/agreement.py`)."""
 
 
 def gabor(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     """One view per step, all views in a new random order per pass -> [H,W,3] float32 in [0,1] and the losses.
 
-    From given.start, whose tones the views have. Raises Stopped, after a checkpoint.
+    From given.start, whose tones the views have; it is the result, and a warning says so, where they do not agree with
+    it. Raises Stopped, after a checkpoint.
+    """
+    return descended(given, given.config.steps)
+
+
+def descended(
+    given: MethodInput,
+    steps: int | None = None,
+    *,
+    passes: float = PASSES,
+    largest: tuple[int, int] | None = None,
+    checkpoint: str = CHECKPOINT,
+) -> tuple[Tensor, list[LossPoint]]:
+    """As `gabor`; steps: None for so many passes over all pixels. largest: crop (width, height) that a step sees.
+
+    checkpoint: the name of its file.
     """
     maps, device = given.maps[1], given.maps[1].device
+    if given.start is not None and (unlike := start_unlikeness(given)) > UNLIKE:
+        given.monitor.warning(_disagree(unlike))
+        return given.start, []
     generator = torch.Generator().manual_seed(given.config.seed)
-    order = drawn_views(maps, given.config.steps, PASSES, generator)
-    width, height = crop_size(maps.width, maps.height)
+    width, height = crop_size(maps.width, maps.height, largest)
+    share = width * height / math.prod(crop_size(maps.width, maps.height))
+    order = drawn_views(maps, steps, passes / share, generator)
     # Windows and octaves lie elsewhere each time, or the texture would fit those of one grid.
     margins = torch.tensor([maps.width - width + 1, maps.height - height + 1])
     corners = (torch.rand((len(order), 2), generator=generator) * margins).long().tolist()
@@ -54,10 +86,31 @@ def gabor(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
         render = sample_texels(values, slots, weights).view(1, height, width, 3).permute(0, 3, 1, 2) * 2 - 1
         return gabor_loss(render, photograph, foreground, filters) + wide_loss(render, photograph, foreground)
 
-    rate = min(MAX_LR, REACH * len(set(order)) / len(order))
-    texture, losses = descend(given, "gabor", unlikeness, len(order), generator, rate=rate)
+    # Adam's step goes with the root of how often a texel is seen: a crop's are seen as often, in more steps.
+    rate = min(MAX_LR, REACH * len(set(order)) / (len(order) * share**0.5))
+    texture, losses = descend(given, "gabor", unlikeness, len(order), generator, rate=rate, checkpoint=checkpoint)
     # Energies say how much detail there is, and not where.
     return share_detail(texture, maps, OPTIMIZED), losses
+
+
+def start_unlikeness(given: MethodInput) -> float:
+    """`structure_unlikeness` of given.start to photographs, where it was painted from others; 0 where nothing tells."""
+    maps, start = given.maps[1], given.start
+    if start is None or given.painted is None:
+        return 0.0
+    cells = LeftOutCells(maps, given.painted, structure_unlikeness, areas=shows_areas(maps))
+    some = cells.of(list(range(maps.count)))
+    return cells.unlike(some, start[maps.slot_map >= 0]) if some else 0.0
+
+
+def _disagree(unlike: float) -> Problem:
+    return Problem(
+        "photographs_disagree",
+        "the cameras' poses",
+        f"photographs do not show the same at the same places of the mesh (unlike by {unlike:.2f}, up to {UNLIKE} can"
+        " be mended), so every place shows one of them as it is",
+        "check that poses, intrinsics and mesh belong together (advtex-client check), and do not leave out refinement",
+    )
 
 
 def wide_loss(render: Tensor, photograph: Tensor, foreground: Tensor) -> Tensor:

@@ -20,7 +20,7 @@ from advtex_engine.core.monitor import Monitor
 from advtex_engine.runtime.files import atomic_file
 from advtex_engine.runtime.shortage import memory_problem
 
-FORMAT = 7
+FORMAT = 8
 """The version of what files hold, raised with every change (`tests/engine/stages/test_work_format.py` compares)."""
 CHECKPOINT = "checkpoint"
 MAX_SHARE = 0.01
@@ -128,21 +128,21 @@ def restore_generator(generator: torch.Generator, state: Tensor, step: int) -> N
 
 
 class Checkpoints:
-    """The checkpoint of a run's optimization; made at its start, loaded, and then saved from time to time.
+    """The checkpoint of a run's optimization (or start): made when it begins, loaded, and then saved from time to time.
 
     The next one is due every `seconds`, and later while checkpoints have taken more than MAX_SHARE of the time.
     steps: of the whole run. A checkpoint of a run with another number is of no use to this one; that happens where the
-    preset "auto" is decided anew, on another kind of device.
+    preset "auto" is decided anew, on another kind of device. name: of its file in the work folder.
     """
 
-    def __init__(self, work: WorkFolder, seconds: float, steps: int) -> None:
-        self.work, self.seconds, self.steps = work, seconds, steps
+    def __init__(self, work: WorkFolder, seconds: float, steps: int, name: str = CHECKPOINT) -> None:
+        self.work, self.seconds, self.steps, self.name = work, seconds, steps, name
         self._started = self._last = time.monotonic()
         self._saving = 0.0
 
     def load(self, *needed: str) -> dict[str, Any] | None:
         """What `save` was given, with these names at least, of the work folder's checkpoint; None without one."""
-        saved = self.work.load(CHECKPOINT, ("seconds", *needed))
+        saved = self.work.load(self.name, ("seconds", *needed))
         if saved is None or saved.get("steps", self.steps) != self.steps:
             return None
         self.work.earlier_seconds = saved["seconds"]
@@ -157,6 +157,6 @@ class Checkpoints:
         """Replaces the checkpoint; beside `content` it holds what all attempts have spent on the optimization."""
         before = time.monotonic()
         seconds = self.work.earlier_seconds + before - self._started
-        self.work.save(CHECKPOINT, {"seconds": seconds, "steps": self.steps, **content})
+        self.work.save(self.name, {"seconds": seconds, "steps": self.steps, **content})
         self._last = time.monotonic()
         self._saving += self._last - before

@@ -12,10 +12,12 @@ from advtex_engine.budget.workload import Workload
 from advtex_engine.core.scene import Atlas, Scene
 from advtex_engine.methods import MethodInput
 from advtex_engine.methods.adversarial import starting_texture
+from advtex_engine.methods.gabor import descended
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.view_selection import select_views
 from advtex_engine.previews.live import Live
 from advtex_engine.render.view_maps import ViewMaps
+from advtex_engine.runtime.available_memory import give_back_unused
 from advtex_engine.runtime.stage_records import Stages
 from advtex_engine.selection.toning import tone_views
 
@@ -37,6 +39,10 @@ def method_input(
         if work.toned:
             for level in maps.values():
                 tone_views(level, starting_texture(given))
+        budget.begin(given.held_bytes)
+        if work.descends:
+            given = replace(given, start=_descended_start(given))
+            give_back_unused()
     stages.save()
     return given
 
@@ -49,3 +55,16 @@ def _selected_start(given: MethodInput) -> tuple[Tensor, Tensor]:
     selection = select_views(given)
     given.work.save("initial_texture", {"texture": selection.texture, "painted": selection.painted})
     return selection.texture, selection.painted
+
+
+def _descended_start(given: MethodInput) -> Tensor:
+    """The start brought nearer to the photographs; from the work folder when it is there, or from where it stood."""
+    saved = given.work.load("descended", ("texture",))
+    if saved is not None:
+        kept: Tensor = saved["texture"].to(given.means[1])
+        return kept
+    texture, _ = descended(given, passes=given.preset.passes, largest=given.preset.descent_crop, checkpoint="descent")
+    given.work.earlier_seconds = 0.0  # what earlier attempts spent here is no part of the optimization
+    if texture is not given.start:  # else what was warned of is to be said again by the next attempt
+        given.work.save("descended", {"texture": texture})
+    return texture

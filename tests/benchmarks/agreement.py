@@ -86,6 +86,7 @@ def _scores(
         holdout=None if scan is None else 8,
         refine=arguments.refine,
         device=arguments.device,
+        **({"face_budget": arguments.faces} if scan is None else {}),
     )
     truth = None
     if scan is None:

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import agreement
 import compiled
 import cv2
 import discriminator
@@ -33,6 +34,7 @@ import examples
 from advtex_engine.adversarial.discriminator import PatchDiscriminator
 from advtex_engine.adversarial.optimizer import AdversarialOptimizer
 from advtex_engine.core.config import TextureConfig
+from advtex_engine.methods import gabor
 from advtex_engine.metrics.lpips import NETWORKS
 from advtex_engine.synthetic import patches
 from advtex_engine.synthetic.real import drawn_scene
@@ -229,6 +231,17 @@ def test_the_errors_of_the_study_are_the_paper_s(monkeypatch: pytest.MonkeyPatch
         pytest.approx((0, 0, 0.3 * 0.03)),
         pytest.approx((0, 0, 0.3 * 0.02 * 1.5**4.5)),
     ]
+
+
+@pytest.mark.slow
+def test_cameras_that_are_turned_agree_less(tmp_path: Path, weights: Path) -> None:
+    """And what `gabor` would do is told on either side of its limit."""
+    line = [*SMALL, "--turns", "0.3", "25", "--levels", "--lpips-weights", str(weights), "--results", str(tmp_path)]
+    agreement.main(line)
+    exact, wrong = (cell["scores"] for cell in json.loads((tmp_path / "agreement.json").read_text())["cells"])
+    assert exact["unlike"] < gabor.UNLIKE < wrong["unlike"]
+    assert all(scores["gabor"] != scores["start"] for scores in (exact, wrong))
+    assert "| cameras | 25 degrees | as they came |" in (tmp_path / "agreement.md").read_text()
 
 
 @pytest.mark.slow

@@ -80,6 +80,19 @@ def test_only_what_another_view_has_painted_is_judged() -> None:
         assert unlike == pytest.approx(float(by_hand), abs=1e-4)
 
 
+def test_chance_is_how_unlike_unrelated_pictures_are() -> None:
+    """Another picture altogether is as unlike as that, the picture itself is not; and by hand."""
+    maps = same_views()
+    cells = LeftOutCells(maps, quarters(), structure_unlikeness)
+    some, noise = cells.of([0, 1, 5]), torch.rand((maps.slots, 3), generator=torch.Generator().manual_seed(1))
+    assert cells.unlike(some, exact(maps)) < 0.05 * cells.chance(some, exact(maps))
+    assert cells.unlike(some, noise) == pytest.approx(cells.chance(some, noise), rel=0.1)
+    (one,) = some[2:]
+    turned = torch.where(one.judged[:, None], one.photograph, one.photograph.flip((2, 3)))
+    unlike = structure_unlikeness(turned, one.photograph.flip((2, 3)))
+    assert cells.chance([one], exact(maps)) == pytest.approx(float(unlike[one.judged].mean()), abs=1e-3)
+
+
 def test_a_view_that_painted_all_that_it_sees_is_no_judge() -> None:
     maps = same_views()
     cells = LeftOutCells(maps, torch.zeros((SIZE, SIZE), dtype=torch.int16), structure_unlikeness)

@@ -14,7 +14,7 @@ between two launches. Only a look waits for the device.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -123,6 +123,10 @@ class LeftOutCells:
             total += (self.unlikeness(shown, some.photograph) * some.judged).sum(dtype=torch.float64)
             count += some.judged.sum()
         return float(total / count)
+
+    def chance(self, cells: list[_Cells], values: Tensor) -> float:
+        """`unlike` to the cells' photographs upside down: what it is where pictures have nothing in common."""
+        return self.unlike([replace(some, photograph=some.photograph.flip((2, 3))) for some in cells], values)
 
     def _cells(self, view: int, most: int) -> _Cells:
         maps = self.maps.only(view)

@@ -38,9 +38,9 @@ REACH = 1e-2
 that are blurred, whatever the rate is, and edges soften; more steps take smaller ones."""
 MAX_LR = 2e-3  # larger steps leave grain
 BLOCK = 8  # pixels a side, of which means are compared; every half of it
-UNLIKE = 0.45
-"""`structure_unlikeness` of the start to photographs that it was not painted from, above which they have nothing in
-common: .08 to .35 on scans that gain by the descent, .54 to .67 where it harms (`tests/benchmarks/agreement.py`)."""
+UNLIKE = 0.6
+"""Of unrelated pictures' unlikeness, what the start has to photographs that it was not painted from where they have
+too little in common: XX on scans that gain by the descent, YY where it harms (`tests/benchmarks/agreement.py`)."""
 
 
 def gabor(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
@@ -94,21 +94,24 @@ def descended(
 
 
 def start_unlikeness(given: MethodInput) -> float:
-    """`structure_unlikeness` of given.start to photographs, where it was painted from others; 0 where nothing tells."""
+    """`structure_unlikeness` of given.start to photographs, where it was painted from others, as a share of what it is
+    to the same photographs upside down; 0 where nothing tells."""
     maps, start = given.maps[1], given.start
     if start is None or given.painted is None:
         return 0.0
     cells = LeftOutCells(maps, given.painted, structure_unlikeness, areas=shows_areas(maps))
     some = cells.of(list(range(maps.count)))
-    return cells.unlike(some, start[maps.slot_map >= 0]) if some else 0.0
+    values = start[maps.slot_map >= 0]
+    chance = cells.chance(some, values) if some else 0.0
+    return cells.unlike(some, values) / chance if chance > 0 else 0.0
 
 
 def _disagree(unlike: float) -> Problem:
     return Problem(
         "photographs_disagree",
         "the cameras' poses",
-        f"photographs do not show the same at the same places of the mesh (unlike by {unlike:.2f}, up to {UNLIKE} can"
-        " be mended), so every place shows one of them as it is",
+        f"photographs do not show the same at the same places of the mesh (they are {unlike:.0%} as unlike as"
+        f" unrelated pictures; up to {UNLIKE:.0%} can be mended), so every place shows one of them as it is",
         "check that poses, intrinsics and mesh belong together (advtex-client check), and do not leave out refinement",
     )
 

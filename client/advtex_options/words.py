@@ -28,6 +28,6 @@ PRESET_COST: dict[Preset, str] = {
     Preset.auto: "about a minute for views of 320x240 on 2 CPU cores, 3 minutes for 640x480",
     Preset.paper: "about 2 hours for views of 320x240 on 2 CPU cores, 8 hours for 640x480; much less on a GPU",
     Preset.full: "about 2 hours for views of 320x240 on 2 CPU cores, 8 hours for 640x480; much less on a GPU",
-    Preset.standard: "about 2 minutes for views of 320x240 on 2 CPU cores, 4 minutes for 640x480",
+    Preset.standard: "1 to 2 minutes for views of 320x240 on 2 CPU cores, 2 to 5 minutes for 640x480",
     Preset.preview: "about 2 minutes for views of 320x240 on 2 CPU cores, 4 minutes for 640x480",
 }

@@ -40,7 +40,7 @@ MAX_LR = 2e-3  # larger steps leave grain
 BLOCK = 8  # pixels a side, of which means are compared; every half of it
 UNLIKE = 0.6
 """Of unrelated pictures' unlikeness, what the start has to photographs that it was not painted from where they have
-too little in common: .05 to .48 on scans that gain by the descent, .72 to .90 where it harms
+too little in common: .09 to .48 on scans that gain by the descent, .72 to .90 where it harms
 (`tests/benchmarks/agreement.py`)."""
 
 

@@ -27,7 +27,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from advtex_engine.atlas.build import build_atlas
+from advtex_engine.atlas.build import build_atlas, for_photographs
 from advtex_engine.core.config import TextureConfig, resolve_preset
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Atlas, Camera, DepthFrame, Mesh, View
@@ -119,7 +119,8 @@ def prepare(scan: Path, config: TextureConfig, work: Path, device: torch.device,
     )
     if config.refines:
         scene = apply_refinement(scene, refine_scene(scene, device, config.seed))
-    atlas = build_atlas(scene.mesh, [view.camera for view in scene.views], config, monitor)
+    suited = for_photographs(config, scene.views)
+    atlas = build_atlas(scene.mesh, [view.camera for view in scene.views], suited, monitor)
     atlas = dataclasses.replace(atlas, mesh=moved(atlas.mesh, device))
     maps = build_view_maps(atlas, scene.views, scene.kind)
     preset = resolve_preset(config)

@@ -13,13 +13,13 @@ from atlases import AROUND, area, bumpy_sphere, camera, check_sound, of_trimesh,
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from advtex_engine.atlas.build import SIZE_STEP, build_atlas, texel_coverage, why_not_kept
+from advtex_engine.atlas.build import SIZE_STEP, build_atlas, for_photographs, texel_coverage, why_not_kept
 from advtex_engine.atlas.charting import PADDING, Charts, make_charts
 from advtex_engine.atlas.density import pixel_density
 from advtex_engine.core.config import TextureConfig
 from advtex_engine.core.errors import OptionError, Problem, ScanError
 from advtex_engine.core.monitor import Monitor
-from advtex_engine.core.scene import Mesh, face_areas
+from advtex_engine.core.scene import Mesh, View, face_areas
 from advtex_engine.mesh.clean import clean
 
 
@@ -51,6 +51,29 @@ def test_texels_follow_the_views(texels_per_pixel: float) -> None:
     )
     atlas = build_atlas(square, [camera((4, 0, 0))], TextureConfig(texels_per_pixel=texels_per_pixel), Listener())
     assert area(texel_corners(atlas)).sum() == pytest.approx((3 * 75 * texels_per_pixel) ** 2, rel=0.03)
+
+
+def photograph(cell: int, mask: torch.Tensor | None = None) -> View:
+    """Of noise that changes every `cell` pixels, and between in straight lines."""
+    seen_from = camera((4, 0, 0), 96, 96)
+    coarse = torch.rand((1, 3, 96 // cell, 96 // cell), generator=torch.Generator().manual_seed(4))
+    picture = torch.nn.functional.interpolate(coarse, (96, 96), mode="bilinear")[0].permute(1, 2, 0)
+    return View("frame", seen_from, (picture * 255).round().to(torch.uint8), mask=mask)
+
+
+def test_blurred_photographs_get_as_many_texels_as_pixels() -> None:
+    config = TextureConfig()
+    assert for_photographs(config, [photograph(1)] * 3) == config
+    assert for_photographs(config, [photograph(3)] * 3).texels_per_pixel == pytest.approx(1.0)
+
+
+def test_what_was_not_scanned_does_not_blur_photographs() -> None:
+    sharp, scanned = photograph(1), torch.arange(96).expand(96, -1) < 8
+    color = torch.where(scanned[..., None], sharp.color, photograph(8).color)
+    config = TextureConfig()
+    assert for_photographs(config, [replace(sharp, color=color)]).texels_per_pixel < 1.1
+    assert for_photographs(config, [replace(sharp, color=color, mask=scanned)]) == config
+    assert for_photographs(config, [replace(sharp, color=color, depth=2.0 * scanned)]) == config
 
 
 def test_what_no_view_sees_gets_few_texels() -> None:

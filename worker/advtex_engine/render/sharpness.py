@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import torch
 from torch import Tensor
 
-from advtex_engine.core.scene import evenly_spread
+from advtex_engine.core.scene import View, evenly_spread
 from advtex_engine.render.texture import footprints, sample_texels
 from advtex_engine.render.view_maps import ViewMaps, foregrounds
 
@@ -27,15 +27,33 @@ def shows_areas(maps: ViewMaps) -> bool:
 
 
 def fineness(maps: ViewMaps) -> float:
-    """Second differences of the photographs as a share of the differences two pixels apart; white noise has 1.7."""
-    sums = torch.zeros(2, device=maps.device)
-    for photograph, seen, _ in _pictures(maps):
+    """Second differences of the photographs as a share of the differences two pixels apart; white noise has 1.7.
+
+    Only what shows the mesh counts.
+    """
+    return _fineness((photograph, seen) for photograph, seen, _ in _pictures(maps))
+
+
+def photographs_fineness(views: Sequence[View]) -> float:
+    """`fineness` where masks leave photographs in and depth was read: for who does not know yet where the mesh is."""
+    return _fineness((view.color / 255, _scanned(view)) for view in evenly_spread(views, VIEWS))
+
+
+def _scanned(view: View) -> Tensor:
+    scanned = torch.ones(view.color.shape[:2], dtype=torch.bool) if view.mask is None else view.mask
+    return scanned if view.depth is None else scanned & (view.depth > 0)
+
+
+def _fineness(pictures: Iterable[tuple[Tensor, Tensor]]) -> float:
+    sums = torch.zeros(2, dtype=torch.float64)
+    for photograph, seen in pictures:
         for axis in (0, 1):
             step = photograph.diff(dim=axis)
             count = step.shape[axis] - 1
             before, after = step.narrow(axis, 0, count), step.narrow(axis, 1, count)
             whole = seen.narrow(axis, 0, count) & seen.narrow(axis, 1, count) & seen.narrow(axis, 2, count)
-            sums += torch.stack([(part.abs() * whole[..., None]).sum() for part in (after - before, after + before)])
+            parts = [(part.abs() * whole[..., None]).sum() for part in (after - before, after + before)]
+            sums += torch.stack(parts).cpu()
     return float(sums[0] / sums[1].clamp(min=1e-12))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from advtex_engine.adversarial.optimizer import native_bfloat16
-from advtex_engine.atlas.build import build_atlas, covered_share
+from advtex_engine.atlas.build import build_atlas, covered_share, for_photographs
 from advtex_engine.atlas.chart_cache import ChartMaker
 from advtex_engine.budget.limits import Budget
 from advtex_engine.budget.workload import Workload
@@ -59,6 +59,7 @@ def _cached_atlas(scene: Scene, config: TextureConfig, folder: WorkFolder, stage
         mesh = Mesh(scene.mesh.v_pos, *(saved[name] for name in OF_MESH))
         return Atlas(mesh, **{name: saved[name] for name in OF_ATLAS})
     with stages.run("atlas"):
+        config = for_photographs(config, scene.views)
         atlas = build_atlas(scene.mesh, [view.camera for view in scene.views], config, stages.monitor, charts)
     saved = {name: getattr(atlas.mesh, name) for name in OF_MESH}
     folder.save("atlas", saved | {name: getattr(atlas, name) for name in OF_ATLAS})

@@ -164,6 +164,18 @@ def test_a_wall_of_two_faces_shows_what_photographs_from_close_by_show_of_it(tmp
     assert (selection.painted > 0).float().mean() > 0.7
 
 
+def test_a_wall_of_two_faces_goes_to_the_views_that_show_its_parts_largest(tmp_path: Path) -> None:
+    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    atlas = Atlas(Mesh(corners, faces, corners[:, :2].clone(), faces), SIDE, SIDE, "scan", 1)
+    ones = torch.ones((SIDE, SIDE, 3))
+    black = view("far", atlas, 0 * ones, camera((0.5, 0.45, 1.6)))
+    places = [(x / 6, y / 6) for x in (1, 3, 5) for y in (1, 3, 5)]
+    white = [view(f"{x} {y}", atlas, ones, camera((x, y - 0.01, 0.35), (x, y, 0))) for x, y in places]
+    texture, _ = texture_function("best_view")(task(atlas, (black, *white), tmp_path))
+    assert texture.mean() > 0.9
+
+
 def test_a_face_goes_to_the_view_that_shows_it_on_most_pixels(around: MethodInput) -> None:
     """Against pixels counted in a rendering of face indices."""
     atlas, maps = around.atlas, around.maps[1]

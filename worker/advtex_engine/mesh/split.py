@@ -14,6 +14,10 @@ from torch import Tensor
 from advtex_engine.core.rows import distinct_rows
 from advtex_engine.core.scene import Atlas, Mesh
 
+# The longest side, in texels, of the faces that photographs are chosen for, over the photographs' width. On five scans
+# with meshes of 10,000 faces view selection's LPIPS is 3.2 % lower than uncut; twice as much wins less, and half makes
+# thrice the faces.
+LONGEST_SIDE = 1 / 20
 # What a face becomes whose first sides are cut (1 and 2 of them) or all: 0 to 2 its corners, 3 to 5 the middles of the
 # sides 0-1, 1-2 and 2-0.
 _PIECES = {

@@ -1,5 +1,7 @@
 """One view per face, each face for itself: the view that shows it largest. Sharp, with seams wherever views disagree.
 
+Large faces are cut as view selection cuts them, or a door would be painted from afar by whoever sees all of it.
+
 Also what every such method shares: `label_faces` with a score of its own, and `paint` from the labels.
 """
 
@@ -11,6 +13,7 @@ import torch
 from torch import Tensor
 
 from advtex_engine.core.scene import Atlas
+from advtex_engine.mesh.split import LONGEST_SIDE, split_long_sides
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.render.reproject import reproject
 from advtex_engine.render.texels import TexelMap, map_texels, surface_points
@@ -31,9 +34,11 @@ def best_view(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
 
 def one_view_texture(given: MethodInput, score: Score) -> Tensor:
     """Every face from the view that `score` puts highest; what no view shows keeps the mean -> [H,W,3] in [0,1]."""
-    maps, texels = given.maps[1], map_texels(given.atlas)
-    labels = label_faces(maps, given.atlas, texels, score)
-    return paint(given, texels, labels)
+    maps = given.maps[1]
+    atlas = split_long_sides(given.atlas, LONGEST_SIDE * maps.width)
+    texels = map_texels(atlas)
+    labels = label_faces(maps, atlas, texels, score)
+    return paint(given, atlas, texels, labels)
 
 
 def label_faces(maps: ViewMaps, atlas: Atlas, texels: TexelMap, score: Score) -> Tensor:
@@ -60,13 +65,13 @@ def label_faces(maps: ViewMaps, atlas: Atlas, texels: TexelMap, score: Score) ->
     return labels
 
 
-def paint(given: MethodInput, texels: TexelMap, labels: Tensor) -> Tensor:
+def paint(given: MethodInput, atlas: Atlas, texels: TexelMap, labels: Tensor) -> Tensor:
     """Each texel's color from its face's view, bicubic -> [H,W,3] in [0,1]; the mean where that view does not see it.
 
-    labels: [T] int64 view of each face, -1 = none.
+    atlas, texels: with the faces that labels [T] int64 tell the views of, -1 = none.
     """
     maps, tolerance = given.maps[1], DEPTH_TOLERANCE[given.scene.kind]
-    points = surface_points(given.atlas.mesh, texels)
+    points = surface_points(atlas.mesh, texels)
     label = labels[texels.face]
     texture = given.means[1].clone()
     flat = texture.view(-1, 3)

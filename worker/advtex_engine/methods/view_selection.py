@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from advtex_engine.mesh.split import split_long_sides
+from advtex_engine.mesh.split import LONGEST_SIDE, split_long_sides
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.render.texels import map_texels
 from advtex_engine.render.texture import fill_holes
@@ -20,10 +20,6 @@ from advtex_engine.selection.leveling import Sampler, blend_texels
 from advtex_engine.selection.mrf import assign_views
 from advtex_engine.selection.shared_detail import share_detail
 from advtex_engine.selection.tones import shared_tones
-
-# The longest side, in texels, of the faces that views are selected for, over the width of the views. On five scans with
-# meshes of 10,000 faces LPIPS is 3.2 % lower than uncut; twice as much wins less, and half makes thrice the faces.
-LONGEST_SIDE = 1 / 20
 
 
 @dataclass(frozen=True)

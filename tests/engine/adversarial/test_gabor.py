@@ -15,7 +15,9 @@ from advtex_engine.adversarial.gabor import (
     LUMA,
     OCTAVES,
     ORIENTATIONS,
+    REACH,
     SIZE,
+    SPACING,
     STRIDE,
     TINY,
     WAVELENGTH,
@@ -78,10 +80,11 @@ def twin_shares(gray: np.ndarray) -> list[np.ndarray]:
                 inside = SIZE // 2
                 energy += response[inside:-inside, inside:-inside] ** 2
             energies.append(np.sqrt(energy))
-        rows, columns = (1 + (side - WINDOW) // STRIDE for side in energies[0].shape)
+        rows, columns = (1 + (side - (WINDOW - SPACING + 1)) // STRIDE for side in energies[0].shape)
+        places = slice(0, WINDOW, SPACING)
         greatest = np.array(
             [
-                [[e[STRIDE * r :, STRIDE * c :][:WINDOW, :WINDOW].max() for c in range(columns)] for r in range(rows)]
+                [[e[STRIDE * r :, STRIDE * c :][places, places].max() for c in range(columns)] for r in range(rows)]
                 for e in energies
             ]
         )
@@ -150,9 +153,9 @@ def test_exposure_costs_little() -> None:
 
 
 def test_images_smaller_than_a_window_have_no_energy() -> None:
-    small = torch.zeros(1, 3, SIZE + WINDOW - 2, 40, requires_grad=True)
+    small = torch.zeros(1, 3, REACH - 1, 40, requires_grad=True)
     assert float(loss_of(small, small.detach())) == 0
-    least = torch.rand(1, 3, SIZE + WINDOW - 1, SIZE + WINDOW - 1)
+    least = torch.rand(1, 3, REACH, REACH)
     assert float(loss_of(least, 1 - least.roll(2, -1))) > 0
 
 

@@ -435,9 +435,9 @@ def test_gabor_renders_means_over_pixels_where_photographs_are_such_means(
     given = replace(given, maps={1: maps}, means={1: mean_texture(maps)}, start=picture, config=config)
     seen = list[int]()
 
-    def sample(values: Tensor, slots: Tensor, weights: Tensor) -> Tensor:
+    def sample(values: Tensor, slots: Tensor, *rest: Tensor) -> Tensor:
         seen.append(slots.shape[1])
-        return sample_texels(values, slots, weights)
+        return sample_texels(values, slots, *rest)
 
     monkeypatch.setattr(gabor, "sample_texels", sample)
     gabor.gabor(given)

@@ -99,6 +99,20 @@ def test_areas_wider_than_their_cells_and_beyond_the_texture_have_whole_weights(
     torch.testing.assert_close(weights.sum(1), torch.ones(300))
 
 
+def test_a_gradient_is_put_where_it_is_wanted_and_nothing_of_the_last_one_stays() -> None:
+    generator = torch.Generator().manual_seed(0)
+    values, into = torch.rand((30, 3), generator=generator), torch.full((30, 3), 7.0)
+    for seed in range(2):
+        slots = torch.randint(0, 20, (50, 4), generator=generator.manual_seed(seed))
+        weights, at = torch.rand((50, 4), generator=generator), values.clone().requires_grad_(True)
+        fresh, put = (
+            torch.autograd.grad(sample_texels(at, slots, weights, *buffer).square().sum(), [at])[0]
+            for buffer in ((), (into,))
+        )
+        assert put.data_ptr() == into.data_ptr()
+        torch.testing.assert_close(put, fresh)
+
+
 def test_sample_image_equals_grid_sample_outside_the_centers_too() -> None:
     image = torch.rand(6, 5, 4, generator=torch.Generator().manual_seed(0))
     xy = torch.tensor([[0.0, 0.0], [5.0, 6.0], [0.5, 0.5], [2.25, 3.75], [4.9, 0.1]])

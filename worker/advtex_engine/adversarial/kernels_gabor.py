@@ -20,7 +20,9 @@ SIZE = tl.constexpr(gabor.SIZE)
 TAPS = tl.constexpr(gabor.SIZE**2)
 WINDOW = tl.constexpr(gabor.WINDOW)
 STRIDE = tl.constexpr(gabor.STRIDE)
-REACH = tl.constexpr((gabor.SIZE + gabor.WINDOW - 2) // gabor.STRIDE + 1)  # windows, across, that see a pixel
+SPACING = tl.constexpr(gabor.SPACING)
+LEAST = tl.constexpr(gabor.REACH)  # pixels a side that the filters of a window lie in
+REACH = tl.constexpr((gabor.REACH - 1) // gabor.STRIDE + 1)  # windows, across, that see a pixel
 FAINT = tl.constexpr(gabor.FAINT)
 TINY = tl.constexpr(gabor.TINY)
 RED, GREEN, BLUE = (tl.constexpr(part / 2) for part in gabor.LUMA)
@@ -29,7 +31,7 @@ RED, GREEN, BLUE = (tl.constexpr(part / 2) for part in gabor.LUMA)
 @triton.jit
 def windows_along(pixels):
     """Windows along a side of so many pixels, which one fits into."""
-    return (pixels - (SIZE + WINDOW - 1)) // STRIDE + 1
+    return (pixels - LEAST) // STRIDE + 1
 
 
 @triton.jit
@@ -131,13 +133,14 @@ def energies(
     """Squared energies of an image, which is the second axis of programs, at its pixels.
 
     grays: [2,PIXELS] float32, of `octaves`. filters: [2,ORIENTATIONS,SIZE,SIZE] float32, even and odd ones.
-    squares: [2,ORIENTATIONS,PIXELS] float32, written where a filter lies inside of the octave.
+    squares: [2,ORIENTATIONS,PIXELS] float32, written at the places of filters, SPACING apart, inside of the octave.
     """
     image = tl.program_id(1)
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     octave, x, y = place_of_pixel(pixel, HEIGHT, WIDTH, OCTAVES)
     width = WIDTH >> octave
     live = (pixel < PIXELS) & (x <= width - SIZE) & (y <= (HEIGHT >> octave) - SIZE)
+    live = live & (x % SPACING == 0) & (y % SPACING == 0)
     orientation = tl.arange(0, PADDED)[:, None]
     there = orientation < ORIENTATIONS
     even, odd = tl.zeros((PADDED, BLOCK), tl.float32), tl.zeros((PADDED, BLOCK), tl.float32)
@@ -185,8 +188,8 @@ def distances(
     place = tl.zeros((PADDED, BLOCK), tl.int32)
     for top in range(0, WINDOW, STRIDE):
         for left in range(0, WINDOW, STRIDE):
-            for below in range(STRIDE):
-                for beside in tl.static_range(STRIDE):
+            for below in range(0, STRIDE, SPACING):
+                for beside in tl.static_range(0, STRIDE, SPACING):
                     down, right = top + below, left + beside
                     at = squares + orientation * PIXELS + (corner + down * width + right)[None, :]
                     value = tl.load(at, mask=live, other=0.0)

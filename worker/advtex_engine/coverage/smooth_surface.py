@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from advtex_engine.core.neighbors import Neighbors
 from advtex_engine.core.rows import distinct_rows
 from advtex_engine.core.scene import Mesh
 
@@ -91,13 +92,13 @@ def harmonic(surface: SmoothSurface, value: Tensor, known: Tensor) -> tuple[Tens
     unknown = has & ~known
     length = (surface.position[start] - surface.position[end]).norm(dim=1)
     weight = 1 / length.clamp(min=1e-6 * float(length.mean()))
-    weight = torch.where(unknown[start] | unknown[end], weight, 0.0)[:, None]
+    reaches = unknown[start] | unknown[end]
+    linked = Neighbors(start[reaches], end[reaches], len(value), weight[reaches])
 
     def laplacian(x: Tensor) -> Tensor:
-        flow = weight * (x[start] - x[end])
-        return torch.zeros_like(x).index_add_(0, start, flow).index_add_(0, end, -flow) * unknown[:, None]
+        return linked.laplacian(x) * unknown[:, None]
 
-    diagonal = torch.zeros_like(value[:, :1]).index_add_(0, start, weight).index_add_(0, end, weight).clamp(min=1e-12)
+    diagonal = linked.degree[:, None].clamp(min=1e-12)
     x = torch.where(known[:, None], value, 0.0)
     x = torch.where(unknown[:, None], value[known].mean(0) if bool(known.any()) else 0.0, x)
     residual = -laplacian(x)

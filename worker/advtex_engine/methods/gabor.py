@@ -78,13 +78,13 @@ def descended(
     corners = (torch.rand((len(order), 2), generator=generator) * margins).long().tolist()
     filters = gabor_filters(device)
 
-    areas = shows_areas(maps)
+    areas, gradient = shows_areas(maps), torch.empty((maps.slots, 3), device=device)
 
     def unlikeness(values: Tensor, step: int) -> Tensor:
         photograph, foreground, slots, weights = _seen(
             maps.only(order[step]), corners[step], (width, height), areas=areas
         )
-        render = sample_texels(values, slots, weights).view(1, height, width, 3).permute(0, 3, 1, 2) * 2 - 1
+        render = sample_texels(values, slots, weights, gradient).view(1, height, width, 3).permute(0, 3, 1, 2) * 2 - 1
         return gabor_loss(render, photograph, foreground, filters) + wide_loss(render, photograph, foreground)
 
     # Adam's step goes with the root of how often a texel is seen: a crop's are seen as often, in more steps.

@@ -27,10 +27,11 @@ def l1(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     generator = torch.Generator().manual_seed(given.config.seed)
     order = drawn_views(maps, given.config.steps, PASSES, generator)
     size = torch.tensor(maps.slot_map.shape[::-1], dtype=torch.float32, device=device)
+    gradient = torch.empty((maps.slots, 3), device=device)
 
     def distance(values: Tensor, step: int) -> Tensor:
         photograph, slots, weights = _footprints(maps.only(order[step]), size)
-        return (sample_texels(values, slots, weights) - photograph).abs().mean()
+        return (sample_texels(values, slots, weights, gradient) - photograph).abs().mean()
 
     return descend(given, "l1", distance, len(order), generator)
 

@@ -121,33 +121,35 @@ def _steps(xy: Tensor, seen: Tensor, axis: int) -> Tensor:
 
 class _SampleTexels(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, values: Tensor, slots: Tensor, weights: Tensor) -> Tensor:
+    def forward(ctx: Any, values: Tensor, slots: Tensor, weights: Tensor, into: Tensor | None) -> Tensor:
         ctx.save_for_backward(slots, weights)
-        ctx.rows = values.shape[0]
+        ctx.rows, ctx.into = values.shape[0], into
         return F.embedding_bag(slots, values, per_sample_weights=weights, mode="sum")
 
     @staticmethod
-    def backward(ctx: Any, *grads: Any) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, *grads: Any) -> tuple[Tensor, None, None, None]:
         slots, weights = ctx.saved_tensors
         (grad,) = grads
         # embedding_bag's own backward sorts the indices (ten times slower on a CPU) and has a gradient for weights.
         # Channel by channel, and in place: index_add_ of short rows takes three times as long, with int32 indices seven
         # times, and a plane of every channel that is copied afterwards twice as long.
         index = slots.flatten().long()
-        dense = grad.new_zeros((ctx.rows, grad.shape[1]))
+        dense = grad.new_zeros((ctx.rows, grad.shape[1])) if ctx.into is None else ctx.into.zero_()
         for channel in range(grad.shape[1]):
             dense[:, channel].index_add_(0, index, (grad[:, channel, None] * weights).flatten())
-        return dense, None, None
+        return dense, None, None, None
 
 
-def sample_texels(values: Tensor, slots: Tensor, weights: Tensor) -> Tensor:
+def sample_texels(values: Tensor, slots: Tensor, weights: Tensor, into: Tensor | None = None) -> Tensor:
     """Weighted sum of some texels per pixel: values [N,C], slots [P,K] integer, weights [P,K] -> [P,C].
 
     Differentiable with respect to `values` only. With the four of `bilinear_footprint` the same as grid_sample
     (bilinear, border, align_corners=False) on the dense texture, without touching the texels that no pixel needs.
+    into: [N,C], takes the gradient, and that of the next step again; to map a fresh one of tens of MB page by page
+    takes a CPU as long as to fill it.
     """
     assert values.ndim == 2 and slots.ndim == 2 and slots.shape == weights.shape
-    out: Tensor = _SampleTexels.apply(values, slots, weights)  # type: ignore[no-untyped-call]
+    out: Tensor = _SampleTexels.apply(values, slots, weights, into)  # type: ignore[no-untyped-call]
     return out
 
 

@@ -15,6 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from advtex_engine.core.neighbors import Neighbors
 from advtex_engine.core.scene import Mesh
 from advtex_engine.render.reproject import MIN_DEPTH
 from advtex_engine.render.texels import TexelMap, surface_points
@@ -70,12 +71,11 @@ def seam_offsets(t_pos_idx: Tensor, label: Tensor, adjacency: Adjacency, nodes: 
     inner = nodes.corner[label >= 0]
     first, second = inner.flatten(), inner.roll(-1, 1).flatten()
 
+    strength = torch.cat((weight[:, 0], weight.new_full((len(first),), SMOOTHNESS)))
+    linked = Neighbors(torch.cat((a, first)), torch.cat((b, second)), len(color), strength)
+
     def apply(x: Tensor) -> Tensor:
-        y = ANCHOR * x
-        for i, j, strength in ((a, b, weight), (first, second, SMOOTHNESS)):
-            flow = (x[i] - x[j]) * strength
-            y = y.index_add(0, i, flow).index_add_(0, j, -flow)
-        return y
+        return ANCHOR * x + linked.laplacian(x)
 
     push = torch.zeros_like(color).index_add_(0, a, gap * weight).index_add_(0, b, -gap * weight)
     return conjugate_gradients(apply, push)
@@ -212,13 +212,11 @@ class Rings:
     def __init__(self, t_pos_idx: Tensor, vertices: int) -> None:
         ends = torch.stack((t_pos_idx, t_pos_idx.roll(-1, 1)), 2).sort(2).values.view(-1, 2)
         key = torch.unique(ends[:, 0] * vertices + ends[:, 1])
-        self.first, self.second = key // vertices, key % vertices
-        degree = torch.bincount(torch.cat((self.first, self.second)), minlength=vertices)
-        self.over = 1 / (1 + degree[:, None].to(torch.float32))
+        self._linked = Neighbors(key // vertices, key % vertices, vertices)
+        self._over = 1 / (1 + self._linked.degree[:, None])
 
     def fade(self, field: Tensor, times: int) -> Tensor:
         """[V,C], `times` replaced by the mean of each vertex and its neighbors."""
         for _ in range(times):
-            total = field.index_add(0, self.first, field[self.second]).index_add_(0, self.second, field[self.first])
-            field = total * self.over
+            field = (field + self._linked.sums(field)) * self._over
         return field

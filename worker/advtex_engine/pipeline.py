@@ -6,6 +6,7 @@ ingest -> conventions -> fusion (of scans without a mesh) -> geometry -> refinem
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -109,30 +110,33 @@ def _run(scan: Path, out: Path, budget: Budget) -> RunResult:
         whole = atlas
         atlas, completed = completed_model(atlas, texture, seen, made["mesh"]["made_up_faces"], config)
     texture = completed.texture
-    with stages.run("export"):
-        outputs = wanted(config.outputs, large=atlas.pages > 1)
-        normals = baked_normals(whole, made["normal_map"], budget.folder)
-        files = export_model(
-            out,
-            atlas,
-            texture,
-            up_axis=scene.up_axis,
-            lossless=config.lossless,
-            usdz="usdz" in outputs,
-            normal_map=normals,
-        )
-        files += write_seen(out, atlas, completed.state)
-        files += write_smaller(
-            out, atlas, texture, outputs, up_axis=scene.up_axis, normal_map=normals, monitor=stages.monitor
-        )
-        files += write_compressed(out, atlas, texture, outputs, lossless=bool(config.lossless))
-        if "tiles" in outputs:
-            files += (write_tiles(out, atlas, texture, up_axis=scene.up_axis, monitor=stages.monitor),)
-    with stages.run("previews"):
-        told = curves(losses, given.live.quality, game["curve"] if game else ())
-        files += write_gallery(out, scene, atlas, texture, mean, told, completed.state)
-        atlas = replace(atlas, mesh=atlas.mesh.to(torch.device("cpu")))
-        scores = heldout_scores(scene, atlas, texture.cpu(), mean.cpu())
+    # Export is of one thread for the most part, as is scoring of one view.
+    on_cpu = replace(atlas, mesh=atlas.mesh.to(torch.device("cpu")))
+    with ThreadPoolExecutor(1, thread_name_prefix="advtex-scores") as beside:
+        scored = beside.submit(heldout_scores, scene, on_cpu, texture.cpu(), mean.cpu())
+        with stages.run("export"):
+            outputs = wanted(config.outputs, large=atlas.pages > 1)
+            normals = baked_normals(whole, made["normal_map"], budget.folder)
+            files = export_model(
+                out,
+                atlas,
+                texture,
+                up_axis=scene.up_axis,
+                lossless=config.lossless,
+                usdz="usdz" in outputs,
+                normal_map=normals,
+            )
+            files += write_seen(out, atlas, completed.state)
+            files += write_smaller(
+                out, atlas, texture, outputs, up_axis=scene.up_axis, normal_map=normals, monitor=stages.monitor
+            )
+            files += write_compressed(out, atlas, texture, outputs, lossless=bool(config.lossless))
+            if "tiles" in outputs:
+                files += (write_tiles(out, atlas, texture, up_axis=scene.up_axis, monitor=stages.monitor),)
+        with stages.run("previews"):
+            told = curves(losses, given.live.quality, game["curve"] if game else ())
+            files += write_gallery(out, scene, atlas, texture, mean, told, completed.state)
+            scores = scored.result()
     parts = {
         "scan": describe_scene(scene),
         **made,

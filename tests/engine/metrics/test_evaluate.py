@@ -278,13 +278,16 @@ def test_views_with_hardly_a_pixel_are_left_out() -> None:
     depth[40:60, 40:60] = 1
     assert MIN_PIXELS > 400
     assert compare(board(), print_(), shot(depth)) is None
-    scores = score_views(board(), print_(), [shot(depth), shot()], None)
-    assert scores["views"] == 1
-    assert score_views(board(), print_(), [shot(depth)], None) == {}
+    scores = score_views(board(), {"print": print_()}, [shot(depth), shot()], None)
+    assert scores["print"]["views"] == 1
+    assert score_views(board(), {"print": print_()}, [shot(depth)], None) == {"print": {}}
 
 
 def test_scores_of_heldout_views_need_no_files() -> None:
-    scores = score_views(board(), print_(), [shot()], random_lpips())
+    gray = torch.full_like(print_(), 0.5)
+    found = score_views(board(), {"print": print_(), "gray": gray}, [shot()], random_lpips())
+    scores = found["print"]
+    assert found["gray"]["lpips"] > 10 * scores["lpips"]
     assert set(scores) == SCORES - {"nearest_patch", "nearest_patch_reverse"} | {"views"}
     assert scores["coverage"] == 1 and scores["lpips"] < 0.01
 

@@ -12,9 +12,17 @@ from plane import HEIGHT, SIDE, WIDTH, blurred, maps_of, noise
 from torch import Tensor
 
 from advtex_engine.render.filtering import blurred as gaussian
-from advtex_engine.render.texture import number_slots
+from advtex_engine.render.texture import number_slots, sample_texels
 from advtex_engine.render.view_maps import ViewMaps
+from advtex_engine.selection import shared_detail
 from advtex_engine.selection.shared_detail import displacement, share_detail
+
+
+@pytest.fixture(autouse=True)
+def _photographs_are_means(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As those of `plane.py` are, however blurred."""
+    monkeypatch.setattr(shared_detail, "shows_areas", lambda _: True)
+
 
 INNER = slice(12, 42)
 PLACES = [(2.3, 1.6), (1.7, 2.2), (2.6, 2.4), (1.4, 1.9), (2.1, 2.8)]
@@ -70,6 +78,22 @@ def test_what_is_wide_stays() -> None:
     rising = truth + torch.linspace(-0.05, 0.05, SIDE)[None, :, None]
     found = share_detail(rising, maps_of([(2.0, 2.0)], truth))
     torch.testing.assert_close(found[INNER, INNER], rising[INNER, INNER], atol=0.012, rtol=0)
+
+
+def test_of_blurred_photographs_the_middles_of_pixels_are_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is no mean over a pixel is not compared with one."""
+    fine = torch.rand((SIDE, SIDE, 3), generator=torch.Generator().manual_seed(0))
+    monkeypatch.undo()
+    for shown, texels in ((fine, 9), (noise(), 4)):
+        seen = set[int]()
+
+        def sample(values: Tensor, slots: Tensor, weights: Tensor, seen: set[int] = seen) -> Tensor:
+            seen.add(slots.shape[1])
+            return sample_texels(values, slots, weights)
+
+        monkeypatch.setattr(shared_detail, "sample_texels", sample)
+        share_detail(shown, maps_of(PLACES, shown))
+        assert seen == {texels}
 
 
 def test_texels_that_no_view_samples_stay() -> None:

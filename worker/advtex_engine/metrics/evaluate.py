@@ -8,7 +8,7 @@ black: leaving difficult faces out does not help. Outside of these pixels both i
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from advtex_engine.metrics.sharpness import band_error, flat_energy, s3_ratio
 from advtex_engine.refine.heldout import refine_heldout
 from advtex_engine.render.pictures import contact_sheet
 from advtex_engine.render.rasterize import rasterize
-from advtex_engine.render.render_view import render_layers
+from advtex_engine.render.render_view import GBuffer, gbuffer, shade_layers
 from advtex_engine.runtime.available_memory import available_memory
 from advtex_engine.runtime.files import json_text, write_atomically
 from advtex_engine.runtime.threads import in_threads, one_thread_each
@@ -174,6 +174,29 @@ def compare(atlas: Atlas, texture: Tensor, view: View, reference: Mesh | None = 
     texture: [atlas.height,atlas.width,3] uint8 sRGB or float in [0,1]. reference: the mesh that decides which pixels
     count, by default the model's own.
     """
+    looked = _look(atlas, view, reference)
+    return None if looked is None else looked.shows(texture)
+
+
+@dataclass(frozen=True)
+class _Looked:
+    """A view of a model, whatever its texture. mask, covered: those of `Comparison`."""
+
+    view: View
+    mask: Tensor
+    covered: Tensor
+    buffer: GBuffer
+
+    def shows(self, texture: Tensor) -> Comparison:
+        color, cover = shade_layers(self.buffer, texture)
+        color = color / cover.clamp(min=1e-6)[..., None]
+        photo = self.view.color.to(torch.float32) / 255
+        image = torch.where(self.mask[..., None], color * self.covered[..., None], photo)
+        return Comparison(self.view.name, photo, image, self.mask, self.covered)
+
+
+def _look(atlas: Atlas, view: View, reference: Mesh | None = None) -> _Looked | None:
+    """None when fewer than MIN_PIXELS count; reference: as for `compare`."""
     fragments = rasterize(atlas.mesh, view.camera)
     target = fragments if reference is None else rasterize(reference, view.camera)
     mask = target.face_index >= 0
@@ -184,11 +207,7 @@ def compare(atlas: Atlas, texture: Tensor, view: View, reference: Mesh | None = 
     if int(mask.sum()) < MIN_PIXELS:
         return None
     covered = mask & (fragments.face_index >= 0) & ((fragments.depth - target.depth).abs() < DEPTH_AGREEMENT)
-    color, cover = render_layers(atlas, texture, view.camera, supersample=_supersample(atlas, fragments))
-    color = color / cover.clamp(min=1e-6)[..., None]
-    photo = view.color.to(torch.float32) / 255
-    image = torch.where(mask[..., None], color * covered[..., None], photo)
-    return Comparison(view.name, photo, image, mask, covered)
+    return _Looked(view, mask, covered, gbuffer(atlas, view.camera, _supersample(atlas, fragments)))
 
 
 def score(comparison: Comparison, lpips: Lpips | None, metrics: dict[str, Metric]) -> Scores:
@@ -213,23 +232,28 @@ def mean_scores(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return means | {"views": len(rows)}
 
 
-def score_views(atlas: Atlas, texture: Tensor, views: Sequence[View], lpips: Lpips | None) -> dict[str, Any]:
-    """Means over views of a model on the scan's own mesh, without the costly nearest patches; empty if none counts.
+def score_views(
+    atlas: Atlas, textures: Mapping[str, Tensor], views: Sequence[View], lpips: Lpips | None
+) -> dict[str, dict[str, Any]]:
+    """Per texture the means over views of a model on the scan's own mesh, without the costly nearest patches; empty
+    if none counts.
 
-    On the CPU, where the same model has the same scores on every machine; as many views side by side as there are
-    threads and room, since most of a view's work is of one thread.
+    On the CPU, where the same model has the same scores on every machine; as many views side by side as there is room
+    and half the threads, since most of a view's work is of one thread and there is other work beside it.
     """
 
-    def scored(view: View) -> Scores | None:
-        comparison = compare(atlas, texture, view)
-        return None if comparison is None else score(comparison, lpips, VIEW_METRICS)
+    def scored(view: View) -> dict[str, Scores] | None:
+        looked = _look(atlas, view)
+        if looked is None:
+            return None
+        return {name: score(looked.shows(texture), lpips, VIEW_METRICS) for name, texture in textures.items()}
 
     pixels = max((view.camera.width * view.camera.height for view in views), default=1)
     room = available_memory(torch.device("cpu")) // 2
-    at_once = min(torch.get_num_threads(), room // (BYTES_PER_SCORED_VIEW + BYTES_PER_SCORED_PIXEL * pixels))
+    at_once = min(torch.get_num_threads() // 2, room // (BYTES_PER_SCORED_VIEW + BYTES_PER_SCORED_PIXEL * pixels))
     with one_thread_each():
-        rows = [row for row in in_threads(scored, views, max(1, at_once)) if row is not None]
-    return mean_scores(rows) if rows else {}
+        found = [rows for rows in in_threads(scored, views, max(1, at_once)) if rows is not None]
+    return {name: mean_scores([rows[name] for rows in found]) if found else {} for name in textures}
 
 
 def write_json(path: Path, evaluation: Evaluation, described: dict[str, Any]) -> None:

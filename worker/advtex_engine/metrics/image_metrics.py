@@ -20,7 +20,7 @@ PATCH = 7
 """Side of the patches that are compared (paper section 4)."""
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
-PROJECTIONS = 256
+PROJECTIONS = 128
 MAX_PATCHES = 1 << 14
 """Patches per image in the sliced Wasserstein distance; of more, as many are drawn, at the same places in both. All
 that a photograph has take nine times as long, and differ by a hundredth."""

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from advtex_engine.metrics.image_metrics import eroded, gradient_magnitude, luminance
 from advtex_engine.refine.exposure import BRIGHT, DARK
-from advtex_engine.render.filtering import blurred, separable
+from advtex_engine.render.filtering import blurred, separable, window_sums
 
 BANDS = 3
 BAND_SIGMA = 1.2
@@ -155,7 +155,7 @@ def flat_pixels(truth: Tensor, mask: Tensor) -> Tensor:
     clear = ((smooth > DARK) & (smooth < BRIGHT)).all(0)
     gradient = gradient_magnitude(blurred(luminance(truth)[None], FLAT_SIGMA)[0])
     radius = FLAT_WINDOW // 2
-    square = F.avg_pool2d(gradient.square()[None, None], FLAT_WINDOW, 1, radius)[0, 0]
+    square = window_sums(gradient.double().square()[None], radius)[0] / FLAT_WINDOW**2
     return eroded(mask, radius) & (square < FLAT_GRADIENT**2) & clear
 
 

@@ -35,7 +35,7 @@ def render_view(
 def render_layers(atlas: Atlas, texture: Tensor, camera: Camera, *, supersample: int = 2) -> tuple[Tensor, Tensor]:
     """Color [H,W,3] times coverage, and coverage [H,W], both float32 in [0,1]: what `render_view` puts together."""
     assert texture.shape == (atlas.height, atlas.width, 3)
-    return _layers(gbuffer(atlas, camera, supersample), texture)
+    return shade_layers(gbuffer(atlas, camera, supersample), texture)
 
 
 @dataclass(frozen=True)
@@ -83,11 +83,12 @@ def renders_at_once(cameras: Sequence[Camera], threads: int, supersample: int = 
 
 def shade(buffer: GBuffer, texture: Tensor, background: float = BACKGROUND) -> Tensor:
     """The picture [H,W,3] of `render_view`; the texture [h,w,3] may have any size."""
-    color, coverage = _layers(buffer, texture)
+    color, coverage = shade_layers(buffer, texture)
     return color + background * (1 - coverage[..., None])
 
 
-def _layers(buffer: GBuffer, texture: Tensor) -> tuple[Tensor, Tensor]:
+def shade_layers(buffer: GBuffer, texture: Tensor) -> tuple[Tensor, Tensor]:
+    """The two layers of `render_layers`; the texture [h,w,3] may have any size."""
     texels = texture.to(torch.float32)
     height, width, _ = texels.shape
     sampled = sample_image(texels, buffer.uv * buffer.uv.new_tensor([width, height]))

@@ -31,6 +31,7 @@ from advtex_scan.matrices import from_quaternion
 MAX_PHOTOGRAPHS = 60
 MAX_HELDOUT = 6
 LONGEST_SIDE = 640
+TONE_SIDE = 160  # pixels, of the renders that tell how tones differ: in averages over a sixteenth of the width
 QUALITY = 90
 """60 photographs of a kitchen at 640x480 take 4 MB."""
 
@@ -51,7 +52,7 @@ def photograph_stream(
     def encoded(shown: tuple[View, Camera]) -> bytes:
         return encode_jpeg(_toned(*shown, atlas, texture), QUALITY)
 
-    cameras = [_reduced(view.camera) for view, _ in chosen]
+    cameras = [_reduced(view.camera, LONGEST_SIDE) for view, _ in chosen]
     views = zip((view for view, _ in chosen), cameras, strict=True)
     jpegs = in_threads(encoded, views, renders_at_once(cameras, threads, supersample=1))
     for (view, heldout), camera, jpeg in zip(chosen, cameras, jpegs, strict=True):
@@ -73,16 +74,23 @@ def photograph_stream(
 
 def _toned(view: View, camera: Camera, atlas: Atlas, texture: Tensor) -> NDArray[np.uint8]:
     """A view's color [h,w,3] as the reduced camera has it, in the tones of the texture."""
-    buffer = gbuffer(atlas, camera, supersample=1)
-    size = (camera.width, camera.height)
-    color = torch.from_numpy(cv2.resize(view.color.numpy(), size, interpolation=cv2.INTER_AREA)).float()
+    coarse = _reduced(camera, TONE_SIDE)
+    buffer = gbuffer(atlas, coarse, supersample=1)
     shown = 255 * shade(buffer, texture).cpu()
-    toned = color + tone_difference(shown - color, _seen(buffer).cpu())
-    return toned.round().clamp(0, 255).to(torch.uint8).numpy()
+    tone = tone_difference(shown - torch.from_numpy(_resized(view.color.numpy(), coarse)), _seen(buffer).cpu())
+    size = (camera.width, camera.height)
+    toned = _resized(view.color.numpy(), camera) + cv2.resize(tone.numpy(), size, interpolation=cv2.INTER_LINEAR)
+    return toned.round().clip(0, 255).astype(np.uint8)
 
 
-def _reduced(camera: Camera) -> Camera:
-    scale = min(1.0, LONGEST_SIDE / max(camera.width, camera.height))
+def _resized(color: NDArray[np.uint8], camera: Camera) -> NDArray[np.float32]:
+    """Averaged to the size of the camera's pictures."""
+    size = (camera.width, camera.height)
+    return np.asarray(cv2.resize(color, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _reduced(camera: Camera, longest: int) -> Camera:
+    scale = min(1.0, longest / max(camera.width, camera.height))
     return scaled_camera(camera, max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
 
 

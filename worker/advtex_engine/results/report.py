@@ -56,10 +56,8 @@ def heldout_scores(scene: Scene, atlas: Atlas, texture: Tensor, mean: Tensor) ->
     if not scene.heldout:
         return None
     lpips, missing = configured_lpips()
-    return {
-        name: score_views(atlas, candidate, scene.heldout, lpips) | {"missing": missing}
-        for name, candidate in (("texture", texture), ("mean", mean))
-    }
+    scores = score_views(atlas, {"texture": texture, "mean": mean}, scene.heldout, lpips)
+    return {name: found | {"missing": missing} for name, found in scores.items()}
 
 
 def write_report(out: Path, report: Mapping[str, Any]) -> Path:

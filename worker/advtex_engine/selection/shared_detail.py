@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advtex_engine.render.filtering import halved, window_sums
+from advtex_engine.render.sharpness import shows_areas
 from advtex_engine.render.texture import footprints, sample_texels
 from advtex_engine.render.view_maps import ViewMaps, foregrounds
 from advtex_engine.runtime.available_memory import available_memory
@@ -53,8 +54,10 @@ def share_detail(texture: Tensor, maps: ViewMaps, share: float = 1.0) -> Tensor:
     values = texture[owned]
     lacking, weight = torch.zeros_like(values), torch.zeros_like(values[:, 0])
 
+    areas = shows_areas(maps)
+
     def agreed(view: int) -> tuple[Tensor, Tensor, Tensor]:
-        return _agreed_detail(values, maps.only(view))
+        return _agreed_detail(values, maps.only(view), areas=areas)
 
     # One view after the other takes two cores half as long again as a view on each. On a GPU there is nothing to gain.
     at_once = 1
@@ -70,11 +73,11 @@ def share_detail(texture: Tensor, maps: ViewMaps, share: float = 1.0) -> Tensor:
     return texture.masked_scatter(owned[..., None], values)
 
 
-def _agreed_detail(values: Tensor, view: ViewMaps) -> tuple[Tensor, Tensor, Tensor]:
+def _agreed_detail(values: Tensor, view: ViewMaps, *, areas: bool) -> tuple[Tensor, Tensor, Tensor]:
     """What the render lacks of P pixels of a view: slots [P*K], how much each counts there [P,K], detail [3,P]."""
     size = (view.height, view.width)
     seen = view.depth.view(size) > 0
-    slots, shares = _footprints(view.uv.view(*size, 2), seen, view.slot_map)
+    slots, shares = _footprints(view.uv.view(*size, 2), seen, view.slot_map, areas=areas)
     photograph = view.color.view(*size, 3).permute(2, 0, 1).to(torch.float32) / 255
     render = sample_texels(values, slots, shares).view(*size, 3).permute(2, 0, 1)
     render = torch.where(seen, render, photograph)
@@ -91,13 +94,13 @@ def _agreed_detail(values: Tensor, view: ViewMaps) -> tuple[Tensor, Tensor, Tens
     return slots[counted].long().flatten(), shares[counted] * agreed[counted, None], detail[:3].flatten(1)[:, counted]
 
 
-def _footprints(uv: Tensor, seen: Tensor, slot_map: Tensor) -> tuple[Tensor, Tensor]:
-    """Those of means over areas, some rows after the others: they take six times the room while they are found."""
+def _footprints(uv: Tensor, seen: Tensor, slot_map: Tensor, *, areas: bool) -> tuple[Tensor, Tensor]:
+    """Some rows after the others: those of means over areas take six times the room while they are found."""
     parts = []
     for first in range(0, len(uv), ROWS):
         last = min(first + ROWS, len(uv))
         rows = slice(max(0, first - 1), min(last + 1, len(uv)))  # whose steps to either side count
-        found = footprints(uv[rows], seen[rows], slot_map, areas=True)
+        found = footprints(uv[rows], seen[rows], slot_map, areas=areas)
         inside = slice((first - rows.start) * uv.shape[1], (last - rows.start) * uv.shape[1])
         parts.append([part[inside] for part in found])
     slots, shares = (torch.cat(part) for part in zip(*parts, strict=True))

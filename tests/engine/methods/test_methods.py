@@ -40,6 +40,7 @@ from advtex_engine.render.texels import map_texels
 from advtex_engine.render.texture import sample_texels
 from advtex_engine.render.view_maps import build_view_maps
 from advtex_engine.runtime.checkpoint import WorkFolder
+from advtex_engine.selection import shared_detail
 from advtex_engine.synthetic.patches import look_at
 from advtex_engine.synthetic.planar import planar_maps
 from advtex_engine.synthetic.scan import synthesize
@@ -312,7 +313,8 @@ def test_gabor_keeps_what_is_sharp_and_sharpens_the_rest_where_photographs_are_d
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Photographs that are off by up to two pixels, each in its own direction; one half of the start is blurred."""
-    monkeypatch.setattr(gabor, "shows_areas", lambda _: True)
+    for module in (gabor, shared_detail):
+        monkeypatch.setattr(module, "shows_areas", lambda _: True)
     fine = torch.rand((1, 3, SIDE // 3, SIDE // 3), generator=torch.Generator().manual_seed(4))
     picture = F.interpolate(fine, (SIDE, SIDE), mode="bilinear")[0].permute(1, 2, 0)
     shifts = list(itertools.product(range(-2, 3), repeat=2))
@@ -448,7 +450,8 @@ def test_gabor_takes_what_is_wide_from_all_photographs_and_keeps_detail(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Spots of twelve pixels that the start shows too dark, over fine print: the print is as sharp as before."""
-    monkeypatch.setattr(gabor, "shows_areas", lambda _: True)
+    for module in (gabor, shared_detail):
+        monkeypatch.setattr(module, "shows_areas", lambda _: True)
     generator = torch.Generator().manual_seed(6)
     fine = F.interpolate(torch.rand((1, 1, SIDE // 3, SIDE // 3), generator=generator), (SIDE, SIDE), mode="bilinear")
     picture = (0.3 + 0.4 * fine[0, 0])[..., None].expand(-1, -1, 3).contiguous()

@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from advtex_engine.adversarial.gabor import gabor_filters, gabor_loss
@@ -123,7 +122,17 @@ def wide_loss(render: Tensor, photograph: Tensor, foreground: Tensor) -> Tensor:
     render, photograph: [1,3,h,w] in [-1,1], at least a block a side; they count where foreground [1,1,h,w] is not 0.
     """
     difference = torch.where(foreground > 0, render - photograph, 0.0)
-    return F.avg_pool2d(difference, BLOCK, BLOCK // 2).abs().mean()
+    return _block_sums(_block_sums(difference, -2), -1).abs().mean() / BLOCK**2
+
+
+def _block_sums(planes: Tensor, axis: int) -> Tensor:
+    """Sums over BLOCK pixels along an axis (-2 or -1), every half of it. avg_pool2d takes a CPU four times as long."""
+    half = BLOCK // 2
+    count = planes.shape[axis] // half
+    whole = planes.narrow(axis, 0, count * half)
+    first, *rest = whole.unflatten(axis, (count, half)).unbind(axis)  # type: ignore[no-untyped-call]
+    sums: Tensor = sum(rest, first)
+    return sums.narrow(axis, 1, count - 1) + sums.narrow(axis, 0, count - 1)
 
 
 def _seen(

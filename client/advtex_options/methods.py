@@ -108,7 +108,7 @@ BUILT_IN = (
     ),
     Method(
         "gabor",
-        "view selection, then nearer to every photograph's fine structure; in about three minutes",
+        "view selection, then nearer to every photograph's fine structure; in about a minute and a half",
         "advtex_engine.methods.gabor:gabor",
         starts_selected=True,
         # The responses to twelve filters, and what comes back through them.

@@ -18,6 +18,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from advtex_engine.render.filtering import halved
+
 WAVELENGTH = 3.0  # pixels
 ORIENTATIONS = 6
 SIZE = 7  # pixels a side of a filter
@@ -26,7 +28,7 @@ STRIDE = 4  # pixels between two windows
 WINDOW = 8  # pixels a side, of whose places the greatest energy counts; whole strides
 SPACING = 2
 """Pixels between two places of a filter, in rows and columns: energies are so smooth that those of every place lead to
-no better texture, in three times the time."""
+no better texture, in more than three times the time."""
 PATCH = SIZE + STRIDE - SPACING  # pixels a side that the filters of a block of STRIDE x STRIDE pixels lie in
 PLACES = (STRIDE // SPACING) ** 2  # of a block
 REACH = SIZE + WINDOW - SPACING  # pixels a side that the filters of a window lie in
@@ -82,7 +84,7 @@ def _shares(gray: Tensor, matrix: Tensor) -> list[Tensor]:
         blocks: Tensor = _GreatestSquares.apply(gray[0], matrix)  # type: ignore[no-untyped-call]
         energies = (F.max_pool2d(blocks[None], WINDOW // STRIDE, 1) + TINY).sqrt()
         found.append(energies / (energies.square().sum(1, keepdim=True) + FAINT**2).sqrt())
-        gray = F.avg_pool2d(gray, 2)
+        gray = halved(gray)
     return found
 
 

@@ -238,8 +238,8 @@ def score_views(
     """Per texture the means over views of a model on the scan's own mesh, without the costly nearest patches; empty
     if none counts.
 
-    On the CPU, where the same model has the same scores on every machine; as many views side by side as there is room
-    and half the threads, since most of a view's work is of one thread and there is other work beside it.
+    On the CPU, where the same model has the same scores on every machine; as many views side by side as there are
+    threads and room, since most of a view's work is of one thread.
     """
 
     def scored(view: View) -> dict[str, Scores] | None:
@@ -250,7 +250,7 @@ def score_views(
 
     pixels = max((view.camera.width * view.camera.height for view in views), default=1)
     room = available_memory(torch.device("cpu")) // 2
-    at_once = min(torch.get_num_threads() // 2, room // (BYTES_PER_SCORED_VIEW + BYTES_PER_SCORED_PIXEL * pixels))
+    at_once = min(torch.get_num_threads(), room // (BYTES_PER_SCORED_VIEW + BYTES_PER_SCORED_PIXEL * pixels))
     with one_thread_each():
         found = [rows for rows in in_threads(scored, views, max(1, at_once)) if rows is not None]
     return {name: mean_scores([rows[name] for rows in found]) if found else {} for name in textures}

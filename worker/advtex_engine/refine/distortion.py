@@ -72,7 +72,7 @@ def fit_distortion(working: WorkingViews, points: Observations, found: Tensor, p
     focal, reach = float(K[0, 0, 0]), _corner(K[0], size)
     unit = torch.tensor([1 / (focal * reach**3), 1 / (focal * reach**5)], device=K.device)  # a pixel at the corner
     for scale, steps in LEVELS:
-        features = local_contrast(luminance, scale)
+        features = working.features if scale == 1 else local_contrast(luminance, scale)
         for _ in range(steps):
             at = _through(found, features, K, poses, points, size)
             residual, weight = residuals(at.value, at.valid, points, ROBUST_SCALE)

@@ -54,6 +54,7 @@ LARGEST_STEP = 3.0  # pixels of the level
 MOST = 0.04  # of the median depth
 ONE_SIDED = 0.9  # share of the looks at the outside from which on a mesh is taken to have one
 SOLVER_STEPS = 60
+MEDIAN_OF = 1_000_000  # readings at least, of which the middle depth is told
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ def refine_geometry(scene: Scene, device: torch.device, seed: int) -> GeometryRe
         seen = given.look(given.moved(offsets)) if report else first
         if first is None or seen is None:
             break
-        features = local_contrast(luminance(color), scale)
+        features = given.features if scale == 1 else local_contrast(luminance(color), scale)
         for _ in range(steps):
             fit_threads()
             offsets = given.step(offsets, features, seen, scale)
@@ -112,10 +113,11 @@ class _Surface:
         self.mesh, self._scene, self._generator = mesh, scene, generator
         self._normal = vertex_normals(mesh)
         self._size = (color.shape[3], color.shape[2])
-        self._features = local_contrast(luminance(color), 1)
+        self.features = local_contrast(luminance(color), 1)
         self._cameras, self._depths = cameras, depths = surface_depths(mesh, scene.views, self._size, scene.kind)
         self._K, self._poses = stack_cameras(cameras, mesh.v_pos.device)
-        self._depth = float(depths[depths > 0].median()) if bool((depths > 0).any()) else 1.0
+        some = depths.flatten()[:: max(1, depths.numel() // MEDIAN_OF)]  # to sort all takes four times their memory
+        self._depth = float(some[some > 0].median()) if bool((some > 0).any()) else 1.0
         sides = torch.cat([mesh.t_pos_idx[:, [a, b]] for a, b in ((0, 1), (1, 2), (2, 0))]).sort(1).values
         self._edges, _ = distinct_rows(sides)
         self._cell = grid_cells(mesh.v_pos[mesh.t_pos_idx].double().mean(1), self._depth)
@@ -131,7 +133,7 @@ class _Surface:
         cameras, depths = self._cameras, self._depths
         if mesh is not self.mesh:
             _, depths = surface_depths(mesh, self._scene.views, self._size, self._scene.kind)
-        detail = torch.hypot(*self._features[:, 1:].unbind(1))
+        detail = torch.hypot(*self.features[:, 1:].unbind(1))
         surface = draw_candidates(mesh, cameras, depths, detail, self._generator)
         if len(surface.position) < MIN_POINTS:
             return None
@@ -139,7 +141,7 @@ class _Surface:
         everything = torch.arange(len(surface.position), device=depths.device)
         most = min(POINTS_PER_VIEW, max(1, LOOKS // len(cameras)))
         points = observe(surface, everything, cameras, depths, most)
-        samples = sample_points(self._features, self._K, self._poses, points, self._size)
+        samples = sample_points(self.features, self._K, self._poses, points, self._size)
         normal = surface.normal[points.point].float() @ self._poses[:, :3, :3].mT.float()
         facing = (normal * samples.local).sum(-1) < 0
         # Of a mesh with an outside, what a view sees from behind is the far side of something thin, through errors.
@@ -214,7 +216,7 @@ class _Surface:
         points, valid, values = seen.points, seen.points.seen & self._aside[seen.surface.face][seen.points.point], []
         for mesh in (self.mesh, found):
             placed = replace(points, position=seen.surface.on(mesh), seen=valid)
-            samples = sample_points(self._features, self._K, self._poses, placed, self._size)
+            samples = sample_points(self.features, self._K, self._poses, placed, self._size)
             values.append(samples.value[..., None])
             valid = samples.valid
         taken = better(values[0], values[1], valid, points, self._cell[seen.surface.face], CONTRAST_SCALE)

@@ -19,6 +19,7 @@ from advtex_engine.refine.solve import Anchor, residuals, solve_views
 from advtex_engine.render.filtering import separable
 
 LEVELS = ((8, 6), (4, 6), (2, 5), (1, 4))  # shrink factor of the image, Gauss-Newton steps
+AT_ONCE = 16  # views whose local contrast is found at once
 CONTRAST_RADIUS = 4  # pixels of the level around which local mean and contrast are taken
 CONTRAST_FLOOR = 0.04  # of the range: what is flatter than that counts less
 ROBUST_SCALE = 0.3  # residual, in local contrasts, at which an observation loses half of its weight
@@ -45,10 +46,22 @@ class PointSamples:
 
 def local_contrast(luminance: Tensor, scale: int) -> Tensor:
     """[V,h,w] in [0,1] -> [V,3,h/scale,w/scale]: normalized value and its gradient per pixel of the full image."""
+    size = (luminance.shape[1], luminance.shape[2])
+    if scale > 1:
+        size = (max(8, size[0] // scale), max(8, size[1] // scale))
+    found = luminance.new_empty((len(luminance), 3, *size))
+    # Of all views at once it would take four times the memory of what is found.
+    for first in range(0, len(luminance), AT_ONCE):
+        views = slice(first, first + AT_ONCE)
+        found[views] = _local_contrast(luminance[views], size)
+    return found
+
+
+def _local_contrast(luminance: Tensor, size: tuple[int, int]) -> Tensor:
     image = luminance[:, None]
     height, width = image.shape[2:]
-    if scale > 1:
-        image = F.interpolate(image, (max(8, height // scale), max(8, width // scale)), mode="area")
+    if size != (height, width):
+        image = F.interpolate(image, size, mode="area")
     image = _blurred(image, 1)
     mean = _blurred(image, CONTRAST_RADIUS)
     deviation = (_blurred(image.square(), CONTRAST_RADIUS) - mean.square()).clamp(min=0).sqrt()
@@ -89,7 +102,12 @@ def sample_features(features: Tensor, pixel: Tensor, size: tuple[int, int]) -> t
 
 
 def refine_poses(
-    luminance: Tensor, K: Tensor, given: Tensor, points: Observations, spread: Observations | None = None
+    luminance: Tensor,
+    K: Tensor,
+    given: Tensor,
+    points: Observations,
+    spread: Observations | None = None,
+    finest: Tensor | None = None,
 ) -> Tensor:
     """world_to_camera [V,4,4] float64 that make the views agree; coarse to fine.
 
@@ -97,12 +115,13 @@ def refine_poses(
     over the surface, whose content is to stay where it is on the average; the mean motion of all cameras is removed
     after each level but the finest: the mesh does not move with the cameras, so that they agree best where the mesh
     is, and what they have in common beyond the anchor's pull is what the photographs insist on. Without, the first
-    view alone moves, and the others hold the gauge.
+    view alone moves, and the others hold the gauge. finest: the luminance's `local_contrast` at full resolution, where
+    it is at hand.
     """
     size = (luminance.shape[2], luminance.shape[1])
     world_to_camera = given
     for scale, steps in LEVELS:
-        features = local_contrast(luminance, scale)
+        features = finest if scale == 1 and finest is not None else local_contrast(luminance, scale)
         for _ in range(steps):
             samples = sample_points(features, K, world_to_camera, points, size)
             residual, weight = residuals(samples.value, samples.valid, points, ROBUST_SCALE)

@@ -33,6 +33,7 @@ from advtex_engine.refine.points import Observations
 from advtex_engine.refine.pose import keep_gauge, refine_poses, sample_points
 from advtex_engine.refine.rig import Device, refine_device
 from advtex_engine.refine.working_views import CONTRAST_SCALE, WorkingViews, motion, working_views
+from advtex_engine.runtime.available_memory import give_back_unused
 from advtex_engine.runtime.threads import in_threads, one_thread_each
 
 COLOR_SCALE = 0.1  # disagreements beyond twice that are highlights
@@ -85,6 +86,7 @@ def refine_scene(scene: Scene, device: torch.device, seed: int) -> Refinement:
             again = refine_cameras(refined, device, seed, shared=False)
             refinement = replace(refinement, world_to_camera=again.world_to_camera)
             refined = apply_refinement(scene, refinement)
+        give_back_unused()  # what cameras took, before geometry takes as much
         geometry = refine_geometry(refined, device, seed)
         rounds.append(geometry.report)
         if geometry.v_pos is None:
@@ -119,7 +121,8 @@ def refine_cameras(scene: Scene, device: torch.device, seed: int, shared: bool =
         if common is not None:
             full = common.at_scale(*scale)
             views = tuple(_on_device(view, full) for view in placed.scene.views)
-            other = _placed(replace(scene, views=views), common.offset.to(given) @ given, device, seed)
+            moved_scene, by_then = replace(scene, views=views), common.offset.to(given) @ given
+            other = _placed(moved_scene, by_then, device, seed, placed.working)
             if other is not None and _agrees_better(other, placed, common):
                 placed, common = other, full
                 described["device"] |= _describe(full, views[0].camera)
@@ -245,9 +248,11 @@ class _Placed:
     columns: dict[str, Tensor]
 
 
-def _placed(scene: Scene, given: Tensor, device: torch.device, seed: int) -> _Placed | None:
-    """None where too few views share anything."""
-    working = working_views(scene.mesh, scene.views, scene.kind, device, seed)
+def _placed(
+    scene: Scene, given: Tensor, device: torch.device, seed: int, like: WorkingViews | None = None
+) -> _Placed | None:
+    """None where too few views share anything. like: of the same photographs, by other cameras."""
+    working = working_views(scene.mesh, scene.views, scene.kind, device, seed, like)
     return None if working is None else _Placed(scene, working, given, *_poses(working, given))
 
 
@@ -270,7 +275,9 @@ def _poses(working: WorkingViews, given: Tensor) -> tuple[Tensor, dict[str, Tens
     given: [V,4,4], what they have to be better than; where the search begins is in `working`.
     """
     checked, cell = working.checked, working.checked_cell
-    found = refine_poses(working.luminance, working.K, working.given, working.fitted, working.spread)
+    found = refine_poses(
+        working.luminance, working.K, working.given, working.fitted, working.spread, finest=working.features
+    )
     before = sample_points(working.features, working.K, given, checked, working.size)
     good = torch.ones(len(given), dtype=torch.bool, device=given.device)
     # One view's return to its given pose changes what the others are compared with.

@@ -60,14 +60,14 @@ class WorkingViews:
 
 
 def working_views(
-    mesh: Mesh, views: tuple[View, ...], kind: str, device: torch.device, seed: int
+    mesh: Mesh, views: tuple[View, ...], kind: str, device: torch.device, seed: int, like: WorkingViews | None = None
 ) -> WorkingViews | None:
-    """None when hardly anything is seen by two views."""
+    """None when hardly anything is seen by two views. like: of the same photographs, by other cameras."""
     generator = torch.Generator().manual_seed(seed)
     mesh = Mesh(mesh.v_pos.to(device), mesh.t_pos_idx.to(device))
-    color = working_color(views, device)
+    color = working_color(views, device) if like is None else like.color
     size = (color.shape[3], color.shape[2])
-    features = local_contrast(luminance(color), 1)
+    features = local_contrast(luminance(color), 1) if like is None else like.features
     cameras, depths = surface_depths(mesh, views, size, kind)
     K, given = stack_cameras(cameras, device)
     candidates = draw_candidates(mesh, cameras, depths, torch.hypot(*features[:, 1:].unbind(1)), generator)
@@ -92,7 +92,8 @@ def working_color(views: Sequence[View], device: torch.device) -> Tensor:
 
 def luminance(color: Tensor) -> Tensor:
     """[V,3,h,w] -> [V,h,w]."""
-    return (color * color.new_tensor(LUMINANCE)[:, None, None]).sum(1)
+    red, green, blue = LUMINANCE
+    return (red * color[:, 0]).add_(color[:, 1], alpha=green).add_(color[:, 2], alpha=blue)
 
 
 def motion(found: Tensor, working: WorkingViews) -> Tensor:

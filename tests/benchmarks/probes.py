@@ -190,7 +190,8 @@ def _against_truth(given: MethodInput, scan: Path, lpips: Lpips) -> Score:
 
 
 def _against_photographs(given: MethodInput, lpips: Lpips) -> Score:
-    return lambda texture: float(score_views(given.atlas, texture, given.scene.heldout, lpips)["lpips"])
+    views = given.scene.heldout
+    return lambda texture: float(score_views(given.atlas, {"": texture}, views, lpips)[""]["lpips"])
 
 
 def ranks(values: Sequence[float]) -> list[float]:

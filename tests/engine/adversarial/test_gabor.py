@@ -15,7 +15,6 @@ from advtex_engine.adversarial.gabor import (
     LUMA,
     OCTAVES,
     ORIENTATIONS,
-    REACH,
     SIZE,
     SPACING,
     STRIDE,
@@ -24,6 +23,7 @@ from advtex_engine.adversarial.gabor import (
     WINDOW,
     gabor_filters,
     gabor_loss,
+    window_reach,
 )
 
 FILTERS = gabor_filters(torch.device("cpu"))
@@ -153,9 +153,9 @@ def test_exposure_costs_little() -> None:
 
 
 def test_images_smaller_than_a_window_have_no_energy() -> None:
-    small = torch.zeros(1, 3, REACH - 1, 40, requires_grad=True)
+    small = torch.zeros(1, 3, window_reach() - 1, 40, requires_grad=True)
     assert float(loss_of(small, small.detach())) == 0
-    least = torch.rand(1, 3, REACH, REACH)
+    least = torch.rand(1, 3, window_reach(), window_reach())
     assert float(loss_of(least, 1 - least.roll(2, -1))) > 0
 
 

@@ -29,12 +29,14 @@ WINDOW = 8  # pixels a side, of whose places the greatest energy counts; whole s
 SPACING = 2
 """Pixels between two places of a filter, in rows and columns: energies are so smooth that those of every place lead to
 no better texture, in more than three times the time."""
-PATCH = SIZE + STRIDE - SPACING  # pixels a side that the filters of a block of STRIDE x STRIDE pixels lie in
-PLACES = (STRIDE // SPACING) ** 2  # of a block
-REACH = SIZE + WINDOW - SPACING  # pixels a side that the filters of a window lie in
 FAINT = 0.2  # energies well below count as none; of colors in [0, 1]
 TINY = 1e-6  # under the root of the energy, which has no slope at 0
 LUMA = (0.299, 0.587, 0.114)
+
+
+def window_reach() -> int:
+    """Pixels a side that the filters of a window lie in."""
+    return SIZE + WINDOW - SPACING
 
 
 def gabor_filters(device: torch.device) -> Tensor:
@@ -80,7 +82,7 @@ def _gray(image: Tensor) -> Tensor:
 def _shares(gray: Tensor, matrix: Tensor) -> list[Tensor]:
     """[1,h,w] -> per octave [1,ORIENTATIONS,...], for each window a vector that is shorter than 1."""
     found: list[Tensor] = []
-    while len(found) < OCTAVES and min(gray.shape[-2:]) >= REACH:
+    while len(found) < OCTAVES and min(gray.shape[-2:]) >= window_reach():
         blocks: Tensor = _GreatestSquares.apply(gray[0], matrix)  # type: ignore[no-untyped-call]
         energies = (F.max_pool2d(blocks[None], WINDOW // STRIDE, 1) + TINY).sqrt()
         found.append(energies / (energies.square().sum(1, keepdim=True) + FAINT**2).sqrt())
@@ -89,11 +91,14 @@ def _shares(gray: Tensor, matrix: Tensor) -> list[Tensor]:
 
 
 def _placed(filters: Tensor) -> Tensor:
-    """[2 ORIENTATIONS * PLACES, PATCH^2]: every filter at every place of a block, as rows to multiply a patch by."""
-    placed = filters.new_zeros((len(filters), PLACES, PATCH, PATCH))
-    for number, (down, right) in enumerate(itertools.product(range(0, STRIDE, SPACING), repeat=2)):
+    """[2 ORIENTATIONS * places, side^2]: every filter at every place of a block of STRIDE x STRIDE pixels, as rows to
+    multiply a patch by, of so many pixels a side."""
+    places = list(itertools.product(range(0, STRIDE, SPACING), repeat=2))
+    side = SIZE + places[-1][0]
+    placed = filters.new_zeros((len(filters), len(places), side, side))
+    for number, (down, right) in enumerate(places):
         placed[:, number, down : down + SIZE, right : right + SIZE] = filters[:, 0]
-    return placed.view(-1, PATCH**2)
+    return placed.view(-1, side**2)
 
 
 class _GreatestSquares(torch.autograd.Function):
@@ -105,9 +110,10 @@ class _GreatestSquares(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, gray: Tensor, matrix: Tensor) -> Tensor:
-        patches = gray.unfold(0, PATCH, STRIDE).unfold(1, PATCH, STRIDE)
+        side = math.isqrt(matrix.shape[1])
+        patches = gray.unfold(0, side, STRIDE).unfold(1, side, STRIDE)
         rows, columns = patches.shape[:2]
-        responses = (matrix @ patches.reshape(-1, PATCH**2).T).view(2, ORIENTATIONS, PLACES, -1)
+        responses = (matrix @ patches.reshape(-1, side**2).T).view(2, ORIENTATIONS, -1, rows * columns)
         squares = responses[0].square().addcmul_(responses[1], responses[1])
         if not ctx.needs_input_grad[0]:
             return squares.amax(1).view(ORIENTATIONS, rows, columns)
@@ -121,6 +127,7 @@ class _GreatestSquares(torch.autograd.Function):
     def backward(ctx: Any, *grads: Any) -> tuple[Tensor, None]:
         matrix, responses, place = ctx.saved_tensors
         pull = 2 * responses * grads[0].reshape(ORIENTATIONS, 1, -1)
-        pulls = pull.new_zeros((2, ORIENTATIONS, PLACES, pull.shape[-1])).scatter_(2, place, pull)
+        places = len(matrix) // (2 * ORIENTATIONS)
+        pulls = pull.new_zeros((2, ORIENTATIONS, places, pull.shape[-1])).scatter_(2, place, pull)
         patches = matrix.T @ pulls.view(len(matrix), -1)
-        return F.fold(patches, ctx.size, PATCH, stride=STRIDE)[0], None
+        return F.fold(patches, ctx.size, math.isqrt(matrix.shape[1]), stride=STRIDE)[0], None

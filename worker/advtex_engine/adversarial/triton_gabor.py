@@ -64,7 +64,7 @@ def gabor_loss(render: Tensor, photograph: Tensor, foreground: Tensor, filters: 
     assert filters.shape == (2 * gabor.ORIENTATIONS, 1, gabor.SIZE, gabor.SIZE)
     height, width = render.shape[-2:]
     halved = [(height >> number, width >> number) for number in range(gabor.OCTAVES)]
-    sides = [side for side in halved if min(side) >= gabor.REACH]
+    sides = [side for side in halved if min(side) >= gabor.window_reach()]
     if not sides:
         return torch.zeros((), device=render.device)
     images = (render, photograph.detach(), foreground)
@@ -75,7 +75,7 @@ def gabor_loss(render: Tensor, photograph: Tensor, foreground: Tensor, filters: 
 
 def _windows(side: tuple[int, int]) -> int:
     """Of an octave of so many pixels a side."""
-    high, wide = ((pixels - gabor.REACH) // gabor.STRIDE + 1 for pixels in side)
+    high, wide = ((pixels - gabor.window_reach()) // gabor.STRIDE + 1 for pixels in side)
     return high * wide
 
 

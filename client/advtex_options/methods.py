@@ -111,8 +111,8 @@ BUILT_IN = (
         "view selection, then nearer to every photograph's fine structure; in about a minute and a half",
         "advtex_engine.methods.gabor:gabor",
         starts_selected=True,
-        # The responses to twelve filters, and what comes back through them.
-        memory=StepMemory(textures=4, rest=2400),
+        # Two gradients; shared detail at the end takes more a pixel than the two views of a step.
+        memory=StepMemory(textures=5, rest=1200),
     ),
     Method(
         "l1",

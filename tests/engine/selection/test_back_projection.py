@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 import torch.nn.functional as F
 from plane import SIDE, blurred, maps_of, noise
@@ -47,10 +48,12 @@ def test_each_texel_hears_its_own_view_alone() -> None:
     assert not torch.equal(clean[5:, : SIDE // 2], start[5:, : SIDE // 2])
 
 
-def test_windows_are_summed_as_a_pool_of_ones_does() -> None:
-    planes = torch.rand((3, 37, 52), generator=torch.Generator().manual_seed(4)) - 0.5
-    expected = 81 * F.avg_pool2d(planes, 9, 1, 4)
-    torch.testing.assert_close(window_sums(planes, 4), expected, atol=1e-4, rtol=0)
+@pytest.mark.parametrize("reach", [0, 1, 2, 3, 4, 7])
+def test_windows_are_summed_as_a_pool_of_ones_does(reach: int) -> None:
+    planes = torch.rand((3, 37, 52), generator=torch.Generator().manual_seed(4))
+    side = 2 * reach + 1
+    expected = side**2 * F.avg_pool2d(planes.double(), side, 1, reach)
+    torch.testing.assert_close(window_sums(planes, reach).double(), expected, atol=0, rtol=1e-6)
 
 
 def test_a_view_that_shows_nothing_of_its_own_is_passed_over() -> None:

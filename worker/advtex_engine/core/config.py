@@ -56,7 +56,7 @@ class Preset:
     areas             the render's pixels are means over what they show, where the photographs' are; else values at
                       their middles (paper; released code)
     max_crop          largest crop (width, height) in pixels; larger views are seen in parts, for cheaper steps
-    descent_crop      the same of the passes before the game, which need 2.4 KB a pixel
+    descent_crop      the same of the passes before the game, which need 1.2 KB a pixel
     max_pair_angle    largest angle between the optical axes of a pair, degrees (released code: 15)
     min_pair_overlap  least share of the source's foreground that the auxiliary view sees
     nearest_share     of the views that remain for a source, rounded up, those whose warped images differ least from it

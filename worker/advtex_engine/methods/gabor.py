@@ -1,6 +1,6 @@
 """View selection's texture, descended to what all photographs agree on but for displacement: no opponent is trained.
 
-Each step compares a view's photograph with the texture's render by Gabor energies (`adversarial/gabor.py`), which
+Each step compares two views' photographs with the texture's renders by Gabor energies (`adversarial/gabor.py`), which
 forgive some pixels, so that every view adds to a texture that begins as a patchwork of single ones. Energies say
 nothing of colors, and nothing of what is wider than their coarsest octave: there means over blocks are compared, which
 some pixels of displacement hardly change either. The render's pixels are means over what they show, where a
@@ -14,6 +14,7 @@ mend. There the texture stays as it is: photographs that it was not painted from
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -29,13 +30,17 @@ from advtex_engine.render.sharpness import shows_areas
 from advtex_engine.render.texture import footprints, sample_texels
 from advtex_engine.render.view_maps import ViewMaps
 from advtex_engine.runtime.checkpoint import CHECKPOINT
+from advtex_engine.runtime.threads import side_by_side
 from advtex_engine.selection.shared_detail import OPTIMIZED, share_detail
 
 PASSES = 5  # over all views, unless the number of steps is asked for
 REACH = 1e-2
 """Rate of the first step times the passes, in colors of [0, 1]: how far texels may go. Further on they fit photographs
 that are blurred, whatever the rate is, and edges soften; more steps take smaller ones."""
-MAX_LR = 2e-3  # larger steps leave grain
+MAX_LR = 2e-3  # larger steps leave grain; by a single view
+TOGETHER = 2
+"""Views of a step. On a CPU they are looked at side by side, with half of the threads each: a view's many small
+operations keep two threads busy for two thirds of the time."""
 BLOCK = 8  # pixels a side, of which means are compared; every half of it
 UNLIKE = 0.6
 """Of unrelated pictures' unlikeness, what the start has to photographs that it was not painted from where they have
@@ -44,7 +49,7 @@ too little in common: .09 to .48 on scans that gain by the descent, .72 to .90 w
 
 
 def gabor(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
-    """One view per step, all views in a new random order per pass -> [H,W,3] float32 in [0,1] and the losses.
+    """Two views per step, all in a new random order per pass -> [H,W,3] float32 in [0,1] and the losses.
 
     From given.start, whose tones the views have; it is the result, and a warning says so, where they do not agree with
     it. Raises Stopped, after a checkpoint.
@@ -71,24 +76,40 @@ def descended(
     generator = torch.Generator().manual_seed(given.config.seed)
     width, height = crop_size(maps.width, maps.height, largest)
     share = width * height / math.prod(crop_size(maps.width, maps.height))
-    order = drawn_views(maps, steps, passes / share, generator)
+    order = drawn_views(maps, steps and TOGETHER * steps, passes / share, generator)
     # Windows and octaves lie elsewhere each time, or the texture would fit those of one grid.
     margins = torch.tensor([maps.width - width + 1, maps.height - height + 1])
     corners = (torch.rand((len(order), 2), generator=generator) * margins).long().tolist()
     filters = gabor_filters(device)
 
-    areas, gradient = shows_areas(maps), torch.empty((maps.slots, 3), device=device)
+    areas = shows_areas(maps)
+    into = [torch.empty((maps.slots, 3), device=device) for _ in range(TOGETHER)]
 
-    def unlikeness(values: Tensor, step: int) -> Tensor:
+    def unlikeness(values: Tensor, number: int) -> tuple[Tensor, Tensor]:
+        values = values.detach().requires_grad_(True)
         photograph, foreground, slots, weights = _seen(
-            maps.only(order[step]), corners[step], (width, height), areas=areas
+            maps.only(order[number]), corners[number], (width, height), areas=areas
         )
-        render = sample_texels(values, slots, weights, gradient).view(1, height, width, 3).permute(0, 3, 1, 2) * 2 - 1
-        return gabor_loss(render, photograph, foreground, filters) + wide_loss(render, photograph, foreground)
+        render = sample_texels(values, slots, weights, into[number % TOGETHER])
+        render = render.view(1, height, width, 3).permute(0, 3, 1, 2) * 2 - 1
+        value = gabor_loss(render, photograph, foreground, filters) + wide_loss(render, photograph, foreground)
+        (slope,) = torch.autograd.grad(value, [values])
+        return value.detach(), slope
 
     # Adam's step goes with the root of how often a texel is seen: a crop's are seen as often, in more steps.
-    rate = min(MAX_LR, REACH * len(set(order)) / (len(order) * share**0.5))
-    texture, losses = descend(given, "gabor", unlikeness, len(order), generator, rate=rate, checkpoint=checkpoint)
+    rate = min(MAX_LR, REACH * len(set(order)) / (len(order) * share**0.5)) * TOGETHER**0.5
+    with side_by_side(TOGETHER if device.type == "cpu" else 1) as mapped:
+
+        def gradient(values: Tensor, step: int) -> tuple[Tensor, Tensor]:
+            numbers = range(step * TOGETHER, min((step + 1) * TOGETHER, len(order)))
+            found = mapped(partial(unlikeness, values), numbers)
+            total = found[0][1]
+            for _, slope in found[1:]:
+                total += slope
+            return torch.stack([value for value, _ in found]).mean(), total
+
+        steps = math.ceil(len(order) / TOGETHER)
+        texture, losses = descend(given, "gabor", gradient, steps, generator, rate=rate, checkpoint=checkpoint)
     # Energies say how much detail there is, and not where.
     return share_detail(texture, maps, OPTIMIZED), losses
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from advtex_engine.methods.descent import descend, drawn_views
+from advtex_engine.methods.descent import descend, drawn_views, gradient_of
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.render.texture import bilinear_footprint, decode_uv, sample_texels
 from advtex_engine.render.view_maps import ViewMaps
@@ -33,7 +33,7 @@ def l1(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
         photograph, slots, weights = _footprints(maps.only(order[step]), size)
         return (sample_texels(values, slots, weights, gradient) - photograph).abs().mean()
 
-    return descend(given, "l1", distance, len(order), generator)
+    return descend(given, "l1", gradient_of(distance), len(order), generator)
 
 
 def _footprints(view: ViewMaps, size: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from advtex_engine.adversarial.pair_sampler import PairSampler
-from advtex_engine.methods.descent import descend
+from advtex_engine.methods.descent import descend, gradient_of
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.metrics.lpips import FeatureStack, load_features
 from advtex_engine.render.pairs import related_pairs
@@ -53,7 +53,7 @@ def vgg(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
             wanted = features(torch.where(pair.visible > 0, (pair.real + 1) / 2, around))
         return torch.stack([(a - b).abs().mean() for a, b in zip(features(fake), wanted, strict=True)]).sum()
 
-    return descend(given, "vgg", distance, preset.steps, generator, views)
+    return descend(given, "vgg", gradient_of(distance), preset.steps, generator, views)
 
 
 def load_vgg() -> FeatureStack:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from advtex_engine.ingest.read import load_scene, opened, sound_scan
 from advtex_engine.mesh.models import load_model, load_reference
 from advtex_engine.metrics.budget import LPIPS_SCORES, budget_scores
 from advtex_engine.metrics.image_metrics import METRICS, nearest_patch_loss
-from advtex_engine.metrics.lpips import Lpips, WeightsError, load_lpips
+from advtex_engine.metrics.lpips import Against, Lpips, WeightsError, load_lpips
 from advtex_engine.metrics.sharpness import band_error, flat_energy, s3_ratio
 from advtex_engine.refine.heldout import refine_heldout
 from advtex_engine.render.pictures import contact_sheet
@@ -187,12 +188,15 @@ class _Looked:
     covered: Tensor
     buffer: GBuffer
 
+    @cached_property
+    def photo(self) -> Tensor:
+        return self.view.color.to(torch.float32) / 255
+
     def shows(self, texture: Tensor) -> Comparison:
         color, cover = shade_layers(self.buffer, texture)
         color = color / cover.clamp(min=1e-6)[..., None]
-        photo = self.view.color.to(torch.float32) / 255
-        image = torch.where(self.mask[..., None], color * self.covered[..., None], photo)
-        return Comparison(self.view.name, photo, image, self.mask, self.covered)
+        image = torch.where(self.mask[..., None], color * self.covered[..., None], self.photo)
+        return Comparison(self.view.name, self.photo, image, self.mask, self.covered)
 
 
 def _look(atlas: Atlas, view: View, reference: Mesh | None = None) -> _Looked | None:
@@ -210,12 +214,16 @@ def _look(atlas: Atlas, view: View, reference: Mesh | None = None) -> _Looked | 
     return _Looked(view, mask, covered, gbuffer(atlas, view.camera, _supersample(atlas, fragments)))
 
 
-def score(comparison: Comparison, lpips: Lpips | None, metrics: dict[str, Metric]) -> Scores:
-    """All scores of a view; None where a metric says nothing (no weights, no flat pixels)."""
+def score(comparison: Comparison, lpips: Lpips | Against | None, metrics: dict[str, Metric]) -> Scores:
+    """All scores of a view; None where a metric says nothing (no weights, no flat pixels).
+
+    lpips: may be that against the comparison's photograph and mask.
+    """
     image, photo, mask = comparison.image, comparison.photo, comparison.mask
     scores: Scores = {"lpips": None, "lpips_full": None}
     if lpips is not None:
-        scores = {"lpips": lpips.masked(image, photo, mask), "lpips_full": lpips.on_black(image, photo, mask)}
+        against = lpips if isinstance(lpips, Against) else Against(lpips, photo, mask)
+        scores = {"lpips": against.masked(image), "lpips_full": against.on_black(image)}
     scores |= {name: metric(image, photo, mask) for name, metric in metrics.items()}
     scores["flat_energy"] = flat_energy(image, photo, comparison.covered)
     scores["coverage"] = float(comparison.covered.sum() / mask.sum())
@@ -246,7 +254,8 @@ def score_views(
         looked = _look(atlas, view)
         if looked is None:
             return None
-        return {name: score(looked.shows(texture), lpips, VIEW_METRICS) for name, texture in textures.items()}
+        against = None if lpips is None else Against(lpips, looked.photo, looked.mask)
+        return {name: score(looked.shows(texture), against, VIEW_METRICS) for name, texture in textures.items()}
 
     pixels = max((view.camera.width * view.camera.height for view in views), default=1)
     room = available_memory(torch.device("cpu")) // 2

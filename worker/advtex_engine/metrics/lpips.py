@@ -12,6 +12,7 @@ import os
 import urllib.request
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -165,30 +166,65 @@ class Lpips:
         return whole[:, 0]
 
     @torch.no_grad()
-    def __call__(self, image: Tensor, truth: Tensor) -> tuple[float, Tensor]:
+    def features(self, image: Tensor) -> list[Tensor]:
+        """Of an image [H,W,3] sRGB in [0,1], [1,C,h,w] per layer."""
+        assert image.ndim == 3 and image.shape[2] == 3
+        found: list[Tensor] = self.stack(image.to(torch.float32).permute(2, 0, 1)[None])
+        return found
+
+    @torch.no_grad()
+    def __call__(self, image: Tensor, truth: Tensor, known: Sequence[Tensor] | None = None) -> tuple[float, Tensor]:
         """Two images [H,W,3] sRGB in [0,1] -> the distance as published, and its map [H,W].
 
-        Per layer: features scaled to unit length per pixel, squared differences weighted by the heads. The distance is
-        the sum over layers of the spatial means; the map is the sum of the layers' maps, enlarged bilinearly.
+        known: the truth's `features`, if they are at hand. Per layer: features scaled to unit length per pixel, squared
+        differences weighted by the heads. The distance is the sum over layers of the spatial means; the map is the sum
+        of the layers' maps, enlarged bilinearly.
         """
-        assert image.shape == truth.shape and image.shape[2] == 3
+        assert image.shape == truth.shape
         size = image.shape[:2]
         total, whole = 0.0, torch.zeros(size, device=image.device)
-        pair = torch.stack((image, truth)).to(torch.float32).permute(0, 3, 1, 2)
-        for features, head in zip(self.stack(pair), self.heads, strict=True):
-            layer = _unlike(features[:1], features[1:], head)
+        known = self.features(truth) if known is None else known
+        for ours, theirs, head in zip(self.features(image), known, self.heads, strict=True):
+            layer = _unlike(ours, theirs, head)
             total += float(layer.mean())
             whole += F.interpolate(layer, size, mode="bilinear", align_corners=False)[0, 0]
         return total, whole
 
     def masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
-        """Mean of the map over the mask [H,W]; what lies outside the mask is context, the same in both images."""
-        composed = torch.where(mask[..., None], image, truth)
-        return float(self(composed, truth)[1][mask].mean())
+        """As `Against.masked`."""
+        return Against(self, truth, mask).masked(image)
 
     def on_black(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
+        """As `Against.on_black`."""
+        return Against(self, truth, mask).on_black(image)
+
+
+class Against:
+    """One truth [H,W,3] sRGB in [0,1] with a mask [H,W] bool, which several images are compared with.
+
+    Its own features are found once.
+    """
+
+    def __init__(self, lpips: Lpips, truth: Tensor, mask: Tensor) -> None:
+        self.lpips, self.truth, self.mask = lpips, truth, mask
+
+    def masked(self, image: Tensor) -> float:
+        """Mean of the map over the mask; what lies outside the mask is context, the same in both images."""
+        composed = torch.where(self.mask[..., None], image, self.truth)
+        return float(self.lpips(composed, self.truth, self._features)[1][self.mask].mean())
+
+    def on_black(self, image: Tensor) -> float:
         """The distance as published with both images black outside the mask; the black part is averaged in."""
-        return self(image * mask[..., None], truth * mask[..., None])[0]
+        inside = self.mask[..., None]
+        return self.lpips(image * inside, self.truth * inside, self._features_on_black)[0]
+
+    @cached_property
+    def _features(self) -> list[Tensor]:
+        return self.lpips.features(self.truth)
+
+    @cached_property
+    def _features_on_black(self) -> list[Tensor]:
+        return self.lpips.features(self.truth * self.mask[..., None])
 
 
 def _unlike(features: Tensor, truths: Tensor, head: Tensor) -> Tensor:

@@ -20,7 +20,7 @@ from advtex_engine.core.monitor import Monitor
 from advtex_engine.runtime.files import atomic_file
 from advtex_engine.runtime.shortage import memory_problem
 
-FORMAT = 8
+FORMAT = 9
 """The version of what files hold, raised with every change (`tests/engine/stages/test_work_format.py` compares)."""
 CHECKPOINT = "checkpoint"
 MAX_SHARE = 0.01

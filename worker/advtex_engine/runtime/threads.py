@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -45,14 +45,37 @@ def in_threads(function: Callable[[T], R], items: Iterable[T], workers: int | No
 
 
 @contextmanager
-def one_thread_each() -> Iterator[None]:
-    """Within it PyTorch's operations on the CPU take one thread: those on small pictures mostly wait for a second."""
+def side_by_side(workers: int) -> Iterator[Callable[[Callable[[T], R], Sequence[T]], list[R]]]:
+    """Within it a map whose calls go on in `workers` threads, which share those that PyTorch's operations take.
+
+    One call after the other where these take only one.
+    """
+    with ThreadPoolExecutor(workers, thread_name_prefix="advtex") as pool:
+
+        def mapped(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
+            threads = torch.get_num_threads()
+            if min(workers, threads, len(items)) == 1:
+                return [function(item) for item in items]
+            with threads_each(max(1, threads // workers)):
+                return list(pool.map(function, items))
+
+        yield mapped
+
+
+@contextmanager
+def threads_each(count: int) -> Iterator[None]:
+    """Within it PyTorch's operations on the CPU take so many threads, also those of threads that begin in it."""
     threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+    torch.set_num_threads(count)
     try:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+def one_thread_each() -> AbstractContextManager[None]:
+    """Within it PyTorch's operations on the CPU take one thread: those on small pictures mostly wait for a second."""
+    return threads_each(1)
 
 
 @dataclass

@@ -46,6 +46,7 @@ class Method:
     draws_pairs: its steps draw pairs of views, and can do with a part of the views on the device at a time.
     plays_game: its steps train a discriminator by the preset, which decides its start, the views' tones and its memory.
     starts_selected: it begins with the texture of view selection, whose tones the views are given.
+    makes_detail: of photographs that are blurred it begins with a texture that lacks the finest detail.
     refines_cameras: cameras and exposures are refined first, whatever was asked for.
     weights: "module:function" that raises, before a run has cost anything, if weights lack; empty: it needs none.
     memory: of a step that plays no game.
@@ -59,6 +60,7 @@ class Method:
     draws_pairs: bool = False
     plays_game: bool = False
     starts_selected: bool = False
+    makes_detail: bool = False
     refines_cameras: bool = False
     weights: str = ""
     memory: StepMemory = StepMemory()
@@ -111,6 +113,7 @@ BUILT_IN = (
         "view selection, then nearer to every photograph's fine structure; in about a minute and a half",
         "advtex_engine.methods.gabor:gabor",
         starts_selected=True,
+        makes_detail=True,
         # Two gradients; shared detail at the end takes more a pixel than the two views of a step.
         memory=StepMemory(textures=5, rest=1200),
     ),

@@ -37,9 +37,8 @@ from advtex_engine.mesh.clean import clean, decimate
 from advtex_engine.mesh.models import load_model
 from advtex_engine.methods import MethodInput, texture_function
 from advtex_engine.methods.adversarial import starting_texture
-from advtex_engine.methods.gabor import descended
+from advtex_engine.methods.gabor import descended, selected_start
 from advtex_engine.methods.mean import mean_texture
-from advtex_engine.methods.view_selection import select_views
 from advtex_engine.metrics.evaluate import PATCH_METRICS, VIEW_METRICS, Comparison, evaluate, score
 from advtex_engine.metrics.lpips import Lpips, WeightsError, load_lpips
 from advtex_engine.previews.live import Live
@@ -148,10 +147,11 @@ def run_method(given: MethodInput, method: str) -> Tensor:
     record = known_methods()[method]
     if record.starts_selected:
         preset = dataclasses.replace(given.preset, start="selection", toned=True)
-        given = started(dataclasses.replace(given, preset=preset))
+        given = started(dataclasses.replace(given, preset=preset), makes_detail=record.makes_detail)
     elif record.plays_game:
-        given = started(given)
-        if given.preset.start == "selection" and given.preset.passes:
+        descends = given.preset.start == "selection" and given.preset.passes > 0
+        given = started(given, makes_detail=descends)
+        if descends:
             start, _ = descended(given, passes=given.preset.passes, checkpoint="descent")
             given = dataclasses.replace(given, start=start)
     given = dataclasses.replace(given, config=dataclasses.replace(given.config, method=method))
@@ -165,12 +165,14 @@ def completed(given: MethodInput, texture: Tensor) -> Tensor:
     return complete_texture(given.atlas, texture, touched & given.facts.get("known", touched)).texture.cpu()
 
 
-def started(given: MethodInput) -> MethodInput:
-    """With the start [H,W,3] in [0,1] that the preset has, and views in its tones if the preset wants that."""
+def started(given: MethodInput, *, makes_detail: bool = False) -> MethodInput:
+    """With the start [H,W,3] in [0,1] that the preset has, and views in its tones if the preset wants that.
+
+    makes_detail: whether a descent follows.
+    """
     start, painted = starting_texture(given), None
     if given.preset.start == "selection":
-        selection = select_views(given)
-        start, painted = selection.texture, selection.painted
+        start, painted = selected_start(given, makes_detail=makes_detail)
     maps = {scale: dataclasses.replace(level, color=level.color.clone()) for scale, level in given.maps.items()}
     if given.preset.toned:
         for level in maps.values():

@@ -29,7 +29,7 @@ from advtex_engine.methods.gabor import BLOCK, PASSES, TOGETHER
 from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.sharpest import sharpness
 from advtex_engine.methods.vgg import WEIGHTS_VARIABLE, load_vgg
-from advtex_engine.methods.view_selection import select_views
+from advtex_engine.methods.view_selection import select_views, with_detail
 from advtex_engine.metrics.lpips import NETWORKS, WeightsError, load_features
 from advtex_engine.pipeline import texture_scan
 from advtex_engine.previews.live import Live
@@ -366,6 +366,23 @@ class Warned(Monitor):
         self.codes.append(problem.code)
 
 
+@pytest.mark.parametrize(
+    ("blurred", "follows", "lacks"), [(True, True, True), (True, False, False), (False, True, False)]
+)
+def test_detail_of_blurred_photographs_is_left_to_the_descent(
+    blurred: bool, follows: bool, lacks: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views = tuple(view(f"{x}", plane(), truth(), camera((x, 0.44, 0.8), (x, 0.45, 0))) for x in (0.4, 0.6))
+    given = task(plane(), views, tmp_path)
+    monkeypatch.setattr(gabor, "shows_areas", lambda _: not blurred)
+    selection = select_views(given)
+    whole = with_detail(selection.texture, selection.painted, given.maps[1])
+    assert not torch.equal(whole, selection.texture)
+    texture, painted = gabor.selected_start(given, makes_detail=follows)
+    assert torch.equal(texture, selection.texture if lacks else whole)
+    assert torch.equal(painted, selection.painted)
+
+
 @pytest.mark.parametrize("agree", [True, False])
 def test_gabor_leaves_a_start_that_other_photographs_have_nothing_to_say_about(tmp_path: Path, agree: bool) -> None:
     """Photographs of one print that are off by two pixels, and photographs of nine prints."""
@@ -380,7 +397,7 @@ def test_gabor_leaves_a_start_that_other_photographs_have_nothing_to_say_about(t
     given = replace(given, maps={1: maps}, means={1: mean_texture(maps)}, start=start, painted=painted)
     texture, losses = gabor.gabor(given)
     assert (gabor.start_unlikeness(given) > gabor.UNLIKE) != agree
-    assert torch.equal(texture, start) != agree
+    assert torch.equal(texture, with_detail(start, painted, maps)) != agree
     assert (monitor.codes, bool(losses)) == ([] if agree else ["photographs_disagree"], agree)
 
 

@@ -16,7 +16,7 @@ from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Atlas, Camera, Mesh, Scene, View
 from advtex_engine.methods import MethodInput, texture_function
 from advtex_engine.methods.mean import mean_texture
-from advtex_engine.methods.view_selection import Selection, select_views, view_selection
+from advtex_engine.methods.view_selection import Selection, select_views, view_selection, with_detail
 from advtex_engine.metrics.image_metrics import gradient_ratio
 from advtex_engine.pipeline import texture_scan
 from advtex_engine.previews.live import Live
@@ -99,7 +99,9 @@ def test_good_photographs_give_the_truth_back(tmp_path: Path) -> None:
     assert selection.texture.shape == (SIDE, SIDE, 3)
     assert bool(((selection.texture >= 0) & (selection.texture <= 1)).all())
     texture, losses = view_selection(asked)
-    assert torch.equal(texture, selection.texture), "the same input gives the same texture"
+    detailed = with_detail(selection.texture, selection.painted, asked.maps[1])
+    assert torch.equal(texture, detailed), "the same input gives the same texture"
+    assert error(replace(selection, texture=texture)) < error(selection)
     assert losses == []
 
 

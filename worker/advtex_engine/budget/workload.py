@@ -80,6 +80,11 @@ class Workload:
         return self.plays and self.starts_selected and self.preset.passes > 0
 
     @property
+    def makes_detail(self) -> bool:
+        """Whether the steps of such a descent follow upon view selection."""
+        return self.descends or known_methods()[self.method].makes_detail
+
+    @property
     def toned(self) -> bool:
         """Whether the views are given the tones of the texture that the method begins with."""
         method = known_methods()[self.method]

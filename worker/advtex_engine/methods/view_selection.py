@@ -12,7 +12,7 @@ from advtex_engine.mesh.split import LONGEST_SIDE, split_long_sides
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.render.texels import map_texels
 from advtex_engine.render.texture import fill_holes
-from advtex_engine.render.view_maps import DEPTH_TOLERANCE
+from advtex_engine.render.view_maps import DEPTH_TOLERANCE, ViewMaps
 from advtex_engine.selection.back_projection import back_project
 from advtex_engine.selection.candidates import OCCLUSION_SHARE, find_candidates
 from advtex_engine.selection.detail import blur_cost
@@ -37,14 +37,22 @@ class Selection:
 
 
 def view_selection(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
-    """The texture of `select_views`; no iterations, so no losses."""
+    """The texture of `select_views` with its detail; no iterations, so no losses."""
     selection = select_views(given)
     given.facts["known"] = selection.known
-    return selection.texture, []
+    return with_detail(selection.texture, selection.painted, given.maps[1]), []
+
+
+def with_detail(texture: Tensor, painted: Tensor, maps: ViewMaps) -> Tensor:
+    """The texture [H,W,3] of `select_views` with the detail that resampling took, and what its photographs share.
+
+    painted: as `Selection` has it.
+    """
+    return fill_holes(share_detail(back_project(texture, painted.long(), maps), maps), painted >= 0)
 
 
 def select_views(given: MethodInput) -> Selection:
-    """One view per face of at most LONGEST_SIDE, from the views at working size, leveled, with the detail they share.
+    """One view per face of at most LONGEST_SIDE, from the views at working size, leveled.
 
     Not differentiable.
     """
@@ -68,5 +76,4 @@ def select_views(given: MethodInput) -> Selection:
         for part, nothing in ((color, 0), (own, -1), (agreement, 0))
     )
     known = label >= 0
-    texture = fill_holes(share_detail(back_project(fill_holes(color, known), label, maps), maps), known)
-    return Selection(texture, known, label.to(torch.int16), confidence)
+    return Selection(fill_holes(color, known), known, label.to(torch.int16), confidence)

@@ -12,9 +12,8 @@ from advtex_engine.budget.workload import Workload
 from advtex_engine.core.scene import Atlas, Scene
 from advtex_engine.methods import MethodInput
 from advtex_engine.methods.adversarial import starting_texture
-from advtex_engine.methods.gabor import descended
+from advtex_engine.methods.gabor import descended, selected_start
 from advtex_engine.methods.mean import mean_texture
-from advtex_engine.methods.view_selection import select_views
 from advtex_engine.previews.live import Live
 from advtex_engine.render.view_maps import ViewMaps
 from advtex_engine.runtime.available_memory import give_back_unused
@@ -34,7 +33,7 @@ def method_input(
         given = MethodInput(scene, atlas, maps, means, preset, config, monitor, budget.texture_folder(), live)
         given = replace(given, on_device=budget.limits.on_device)
         if work.starts_selected:
-            start, painted = _selected_start(given)
+            start, painted = _selected_start(given, makes_detail=work.makes_detail)
             given = replace(given, start=start, painted=painted)
         if work.toned:
             for level in maps.values():
@@ -47,14 +46,17 @@ def method_input(
     return given
 
 
-def _selected_start(given: MethodInput) -> tuple[Tensor, Tensor]:
-    """The texture by view selection, and which view each texel shows; from the work folder when they are there."""
+def _selected_start(given: MethodInput, *, makes_detail: bool) -> tuple[Tensor, Tensor]:
+    """The texture by view selection, and which view each texel shows; from the work folder when they are there.
+
+    makes_detail: whether steps will, so that the texture need not have it.
+    """
     saved = given.work.load("initial_texture", ("texture", "painted"))
     if saved is not None:
         return saved["texture"].to(given.means[1]), saved["painted"].to(given.means[1].device)
-    selection = select_views(given)
-    given.work.save("initial_texture", {"texture": selection.texture, "painted": selection.painted})
-    return selection.texture, selection.painted
+    texture, painted = selected_start(given, makes_detail=makes_detail)
+    given.work.save("initial_texture", {"texture": texture, "painted": painted})
+    return texture, painted
 
 
 def _descended_start(given: MethodInput) -> Tensor:
@@ -63,8 +65,9 @@ def _descended_start(given: MethodInput) -> Tensor:
     if saved is not None:
         kept: Tensor = saved["texture"].to(given.means[1])
         return kept
-    texture, _ = descended(given, passes=given.preset.passes, largest=given.preset.descent_crop, checkpoint="descent")
+    passes, crop = given.preset.passes, given.preset.descent_crop
+    texture, losses = descended(given, passes=passes, largest=crop, checkpoint="descent")
     given.work.earlier_seconds = 0.0  # what earlier attempts spent here is no part of the optimization
-    if texture is not given.start:  # else what was warned of is to be said again by the next attempt
+    if losses:  # else what was warned of is to be said again by the next attempt
         given.work.save("descended", {"texture": texture})
     return texture

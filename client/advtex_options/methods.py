@@ -110,7 +110,7 @@ BUILT_IN = (
     ),
     Method(
         "gabor",
-        "view selection, then nearer to every photograph's fine structure; in about a minute and a half",
+        "view selection, then nearer to every photograph's fine structure; in a minute and a quarter",
         "advtex_engine.methods.gabor:gabor",
         starts_selected=True,
         makes_detail=True,

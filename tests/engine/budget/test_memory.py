@@ -211,7 +211,7 @@ def test_a_scannet_scene_fits_a_card_of_24_gb() -> None:
 
 def test_the_passes_before_a_game_count_where_they_need_more() -> None:
     work = Workload(10, 640, 480, (512, 512), 100_000, "adversarial", PRESETS["standard"], "cuda")
-    assert fullest(work)["step"] == 2400 * math.prod(crop_size(640, 480))
+    assert fullest(work)["step"] == 1200 * math.prod(crop_size(640, 480))
     narrow = replace(work, preset=replace(work.preset, descent_crop=(96, 64)))
     assert fullest(narrow) == estimate(narrow) == estimate(work)
     assert fullest(replace(work, preset=PRESETS["paper"])) == estimate(replace(work, preset=PRESETS["paper"]))

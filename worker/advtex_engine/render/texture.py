@@ -135,8 +135,10 @@ class _SampleTexels(torch.autograd.Function):
         # times, and a plane of every channel that is copied afterwards twice as long.
         index = slots.flatten().long()
         dense = grad.new_zeros((ctx.rows, grad.shape[1])) if ctx.into is None else ctx.into.zero_()
+        shares = torch.empty_like(weights)
         for channel in range(grad.shape[1]):
-            dense[:, channel].index_add_(0, index, (grad[:, channel, None] * weights).flatten())
+            torch.mul(grad[:, channel, None], weights, out=shares)
+            dense[:, channel].index_add_(0, index, shares.flatten())
         return dense, None, None, None
 
 

@@ -40,6 +40,7 @@ from advtex_engine.render.texels import map_texels
 from advtex_engine.render.texture import sample_texels
 from advtex_engine.render.view_maps import build_view_maps
 from advtex_engine.runtime.checkpoint import WorkFolder
+from advtex_engine.runtime.threads import threads_each
 from advtex_engine.selection import shared_detail
 from advtex_engine.synthetic.patches import look_at
 from advtex_engine.synthetic.planar import planar_maps
@@ -548,6 +549,16 @@ def test_gabor_gives_the_same_texture_stopped_or_not(tmp_path: Path) -> None:
     resumed, later = texture_function("gabor")(flat_task(tmp_path / "parts", steps=30)[0])
     assert torch.equal(whole, resumed)
     assert losses == later
+
+
+def test_views_of_a_step_side_by_side_are_what_they_are_one_after_the_other(tmp_path: Path) -> None:
+    ends = []
+    for threads in (1, 2):
+        with threads_each(threads):
+            ends.append(texture_function("gabor")(flat_task(tmp_path / str(threads), steps=6)[0])[0])
+    start = flat_task(tmp_path / "start", steps=6)[0].means[1]
+    assert float((ends[0] - start).abs().mean()) > 1e-3
+    torch.testing.assert_close(ends[0], ends[1], atol=1e-4, rtol=0)
 
 
 def test_gabor_begins_with_the_photographs_in_the_tones_of_view_selection(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +16,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from advtex_engine.runtime import threads
-from advtex_engine.runtime.threads import fit_threads, fitting_threads, thread_limit, threads_fitted
+from advtex_engine.runtime.threads import (
+    fit_threads,
+    fitting_threads,
+    side_by_side,
+    thread_limit,
+    threads_each,
+    threads_fitted,
+)
 
 CORES = len(os.sched_getaffinity(0))
 
@@ -47,6 +55,28 @@ class Machine:
         self._stat.write_text(
             f"cpu  1 1 1 1\ncpu{core} {self._ticks} 0 0 {self._at} 0 0 0 0 0 0\ncpu9999 {self._at} 0 0 0 0 0 0 0 0 0\n"
         )
+
+
+def test_calls_side_by_side_share_the_threads_of_operations() -> None:
+    meeting = threading.Barrier(2, timeout=20)
+
+    def call(number: int) -> tuple[int, int]:
+        meeting.wait()
+        return number, torch.get_num_threads()
+
+    with threads_each(4), side_by_side(2) as mapped:
+        for _ in range(2):
+            assert mapped(call, [1, 2]) == [(1, 2), (2, 2)]
+        assert torch.get_num_threads() == 4
+        assert mapped(lambda _: torch.get_num_threads(), [1]) == [4], "one alone has them all"
+
+
+def test_without_threads_for_it_calls_follow_one_another() -> None:
+    with threads_each(1), side_by_side(2) as mapped:
+        assert mapped(lambda number: (number, threading.get_ident()), [1, 2]) == [
+            (1, threading.get_ident()),
+            (2, threading.get_ident()),
+        ]
 
 
 def test_cores_that_others_use_are_left_to_them() -> None:

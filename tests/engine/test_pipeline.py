@@ -27,7 +27,7 @@ from advtex_engine.runtime.devices import choose_device
 from advtex_engine.runtime.stage_records import Stages
 from advtex_engine.synthetic.scan import synthesize
 
-STEPS = 24
+STEPS = 40
 CPU = torch.device("cpu")
 
 
@@ -170,7 +170,7 @@ def test_a_box_is_cut_out_closed_and_rid_of_what_was_never_seen(
 def test_a_stopped_run_resumes_to_the_same_bytes_without_redoing_earlier_stages(
     scan: Path, whole: tuple[Path, Recorder], tmp_path: Path
 ) -> None:
-    with pytest.raises(Stopped, match="step 10 of 24"):
+    with pytest.raises(Stopped, match="step 10 of 40"):
         texture_scan(scan, tmp_path, CONFIG, work=tmp_path / "work", monitor=Recorder(stop_at=10))
     first = torch.load(tmp_path / "work" / "checkpoint.pt")["seconds"]
     again = Recorder()

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -24,6 +24,7 @@ from advtex_engine.adversarial.unlikeness import Unlikeness
 from advtex_engine.core.scene import evenly_spread
 from advtex_engine.render.texture import footprints, sample_texels
 from advtex_engine.render.view_maps import ViewMaps
+from advtex_engine.runtime.threads import in_threads, one_thread_each
 
 PARTS = 5
 """Every view is left out in one of so many turns: more parts would be smaller samples, fewer would be missed more."""
@@ -36,6 +37,8 @@ Probed = dict[str, Any]
 """What one level tells of its turns."""
 LeaveOut = Callable[[Tensor], None]
 """Views [V] bool, on the CPU: the pairs of the steps to come have none of them."""
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 @dataclass
@@ -110,23 +113,30 @@ class LeftOutCells:
         area = self.maps.width * self.maps.height / (self.width * self.height)
         most = min(CELLS, int(AREAS * area))
         some = views if len(views) <= most else evenly_spread(views, most)
-        found = [self._cells(view, most // len(some)) for view in some]
+        found = self._each(lambda view: self._cells(view, most // len(some)), some)
         return [cells for cells in found if len(cells.photograph)]
 
     def unlike(self, cells: list[_Cells], values: Tensor) -> float:
         """The mean over all judged pixels; values: compact texture [slots,3]. Waits for the device."""
-        total, count = values.new_zeros((), dtype=torch.float64), values.new_zeros((), dtype=torch.float64)
-        for some in cells:
+
+        def total(some: _Cells) -> Tensor:
             shown = sample_texels(values, some.slots, some.weights).clamp(0, 1)
             shown = shown.view(*some.judged.shape, 3).permute(0, 3, 1, 2)
             shown = torch.where(some.judged[:, None], shown, some.photograph)
-            total += (self.unlikeness(shown, some.photograph) * some.judged).sum(dtype=torch.float64)
-            count += some.judged.sum()
-        return float(total / count)
+            judged = (self.unlikeness(shown, some.photograph) * some.judged).sum(dtype=torch.float64)
+            return torch.stack((judged, some.judged.sum(dtype=torch.float64)))
+
+        unlike, count = torch.stack([values.new_zeros(2, dtype=torch.float64), *self._each(total, cells)]).sum(0)
+        return float(unlike / count)
 
     def chance(self, cells: list[_Cells], values: Tensor) -> float:
         """`unlike` to the cells' photographs upside down: what it is where pictures have nothing in common."""
         return self.unlike([replace(some, photograph=some.photograph.flip((2, 3))) for some in cells], values)
+
+    def _each(self, function: Callable[[T], R], items: Sequence[T]) -> list[R]:
+        """In threads on a CPU: what each takes is small pictures'."""
+        with one_thread_each():
+            return list(in_threads(function, items, None if self.maps.device.type == "cpu" else 1))
 
     def _cells(self, view: int, most: int) -> _Cells:
         maps = self.maps.only(view)

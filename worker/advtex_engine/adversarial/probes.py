@@ -31,6 +31,7 @@ PARTS = 5
 LEAST_VIEWS = 3  # that can be drawn; of two, one would be left to play with itself
 CELL, CELLS, AREAS = 128, 24, 4
 """Side of a cell in pixels, how many a look takes at most, and of how many views' area: it costs one or two steps."""
+AT_ONCE = 2  # views on a CPU: more would take more than the estimate has for them
 LEAST_UNLIKE = 1e-6  # what is nearer to a photograph than this is the photograph
 
 Probed = dict[str, Any]
@@ -134,9 +135,10 @@ class LeftOutCells:
         return self.unlike([replace(some, photograph=some.photograph.flip((2, 3))) for some in cells], values)
 
     def _each(self, function: Callable[[T], R], items: Sequence[T]) -> list[R]:
-        """In threads on a CPU: what each takes is small pictures'."""
+        """On a CPU some at a time, on a thread each."""
+        at_once = min(AT_ONCE, torch.get_num_threads()) if self.maps.device.type == "cpu" else 1
         with one_thread_each():
-            return list(in_threads(function, items, None if self.maps.device.type == "cpu" else 1))
+            return list(in_threads(function, items, at_once))
 
     def _cells(self, view: int, most: int) -> _Cells:
         maps = self.maps.only(view)

@@ -57,7 +57,7 @@ def write_smaller(
             remedy = "remove small loose pieces from the mesh, or lower the face budget or the largest texture"
             monitor.warning(Problem("mobile_limits_missed", files[-1].name, "; ".join(missed), remedy))
     if "lod" in outputs:
-        level = replace(full, normal_map=None)
+        level = full if full.normal_map is None else replace(full, normal_map=None)
         for number in range(1, LEVELS + 1):
             path = out / f"{name}_lod{number}.glb"
             faces = max(level.faces // QUARTER, LEAST_FACES)

@@ -45,7 +45,7 @@ class Method:
     function: "module:function", from the engine's `MethodInput` to a dense texture and its losses; imported by a run.
     draws_pairs: its steps draw pairs of views, and can do with a part of the views on the device at a time.
     plays_game: its steps train a discriminator by the preset, which decides its start, the views' tones and its memory.
-    starts_selected: it begins with the texture of view selection, whose tones the views are given.
+    starts_selected: it begins with selected photographs' texture, whose tones the views are given.
     makes_detail: of photographs that are blurred it begins with a texture that lacks the finest detail.
     refines_cameras: cameras and exposures are refined first, whatever was asked for.
     weights: "module:function" that raises, before a run has cost anything, if weights lack; empty: it needs none.
@@ -109,15 +109,6 @@ BUILT_IN = (
         refines_cameras=True,
     ),
     Method(
-        "gabor",
-        "view selection, then nearer to every photograph's fine structure; in a minute and a quarter",
-        "advtex_engine.methods.gabor:gabor",
-        starts_selected=True,
-        makes_detail=True,
-        # Two gradients; shared detail at the end takes more a pixel than the two views of a step.
-        memory=StepMemory(textures=5, rest=1200),
-    ),
-    Method(
         "l1",
         "least absolute difference to all views",
         "advtex_engine.methods.l1:l1",
@@ -145,10 +136,22 @@ BUILT_IN = (
     ),
     Method(
         "view_selection",
-        "one view per face with few seams, leveled; in about a minute",
+        "one photograph per face, then nearer to every photograph's fine structure; in a minute and a quarter",
         "advtex_engine.methods.view_selection:view_selection",
+        starts_selected=True,
+        makes_detail=True,
+        # Two gradients; shared detail at the end takes more a pixel than the two views of a step.
+        memory=StepMemory(textures=5, rest=1200),
+    ),
+    Method(
+        "view_selection_no_descent",
+        "the same without the latter: few seams, leveled; in about a minute",
+        "advtex_engine.methods.view_selection:view_selection_no_descent",
     ),
 )
+
+EARLIER_NAMES: Mapping[str, str] = MappingProxyType({"gabor": "view_selection"})
+"""Of methods, which jobs that were accepted under them go on to have; they are taken, and not offered."""
 
 
 @cache
@@ -164,7 +167,7 @@ def known_methods() -> Mapping[str, Method]:
             method = point.load()
             if not isinstance(method, Method):
                 raise TypeError(f"{point.value} is a {type(method).__name__} and no advtex_options.methods.Method")
-            if method.name in known:
+            if method.name in known or method.name in EARLIER_NAMES:
                 raise ValueError(f"the name {method.name} is taken")
         except Exception as error:  # whatever a package of others does
             log.warning(
@@ -182,11 +185,16 @@ def _package(point: EntryPoint) -> str:
 
 def chosen_method(method: str | None, preset: str) -> str:
     """The method's name, also where none is asked for: presets but `auto` are recipes of the adversarial method."""
-    return method or ("gabor" if preset == "auto" else "adversarial")
+    if not method:
+        return "view_selection" if preset == "auto" else "adversarial"
+    return EARLIER_NAMES.get(method, method)
 
 
 class _Help(Mapping[str, str]):
-    """The help of `known_methods`, which are looked for when it is read."""
+    """The help of `known_methods`, which are looked for when it is read. Has earlier names, and does not list them."""
+
+    def __contains__(self, name: object) -> bool:
+        return name in known_methods() or name in EARLIER_NAMES
 
     def __getitem__(self, name: str) -> str:
         return known_methods()[name].help

@@ -83,7 +83,7 @@ class Options:
         None,
         "how the texture is made",
         "Method",
-        unset="gabor, or adversarial where one of its presets is asked for",
+        unset="view_selection, or adversarial where one of its presets is asked for",
         choices=METHOD_HELP,
         others="install the package that brings it",
     )

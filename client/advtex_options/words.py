@@ -16,10 +16,10 @@ class Preset(StrEnum):
 
 
 PRESET_HELP: dict[Preset, str] = {
-    Preset.auto: "best and fast on every device: gabor, one photograph per face, sharpened by all of them",
+    Preset.auto: "best and fast on every device: view_selection, one photograph per face, sharpened by all of them",
     Preset.paper: "adversarial as in the paper, from the mean of all photographs, no refined cameras, 50,000 steps",
-    Preset.full: "adversarial, from the texture of gabor, 50,000 small steps; seldom better than standard",
-    Preset.standard: "adversarial, from the texture of gabor, up to 750 steps; minutes on a CPU",
+    Preset.full: "adversarial, from the texture of view_selection, 50,000 small steps; seldom better than standard",
+    Preset.standard: "adversarial, from the texture of view_selection, up to 750 steps; minutes on a CPU",
     Preset.preview: "adversarial, from the best photograph per face, coarse to fine; two minutes on a CPU",
 }
 

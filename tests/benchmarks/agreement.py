@@ -1,10 +1,10 @@
-"""Where `gabor` helps and where it harms: how unlike the start is to photographs that it was not painted from.
+"""Where the descent of `view_selection` helps and where it harms: how unlike its start is to other photographs.
 
     python tests/benchmarks/agreement.py [--turns 0.3 0.6 1.2 2.5 5] [--levels 2.75 4.5] [--scans SCAN …] [--refine]
 
 One synthetic object with cameras that are turned by so many degrees (the study's e_a), and with errors of the geometry;
 and scans of one's own, scored against every 8th frame, which is left out. Cameras stay as they
-came, but for rows of --refine. `gabor` leaves the start as it is above `UNLIKE`; here it never does, so that the table
+came, but for rows of --refine. It leaves the start as it is above `UNLIKE`; here it never does, so that the table
 says what it would have done. Writes agreement.json and agreement.md below --results; goes on with missing cells.
 """
 
@@ -77,11 +77,11 @@ def fill(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
 def _scores(
     arguments: argparse.Namespace, cell: dict[str, Any], scan: Path | None, folder: Path, lpips: Lpips
 ) -> dict[str, float]:
-    """Unlikeness of the start, and LPIPS of it and of `gabor`."""
+    """Unlikeness of the start, and LPIPS of it and of the end."""
     device = choose_device(arguments.device)
     config = TextureConfig(
         preset=arguments.preset,
-        method="gabor",
+        method="view_selection",
         size=parsed_size(arguments.size),
         holdout=None if scan is None else 8,
         refine=arguments.refine,
@@ -99,7 +99,7 @@ def _scores(
     ends, limit = [given.start], gabor.UNLIKE
     gabor.UNLIKE = math.inf
     try:
-        ends.append(gabor.gabor(given)[0])
+        ends.append(gabor.descended(given, given.config.steps)[0])
     finally:
         gabor.UNLIKE = limit
     found = list[float]()
@@ -108,7 +108,7 @@ def _scores(
             found.append(score_texture(given.atlas, texture, truth, lpips)["lpips"])
         else:
             found.append(score_model(given, texture, scan, folder / "model", None, arguments.lpips_weights)["lpips"])
-    return {"unlike": unlike, "start": found[0], "gabor": found[1]}
+    return {"unlike": unlike, "start": found[0], "end": found[1]}
 
 
 def _make(folder: Path, cell: dict[str, Any]) -> None:
@@ -135,17 +135,17 @@ def report(arguments: argparse.Namespace, results: Results) -> None:
                 settings["scan"], ""
             ),
             "refined" if settings["refine"] else "as they came",
-            *(scores[name] for name in ("unlike", "start", "gabor")),
-            scores["gabor"] / scores["start"],
+            *(scores[name] for name in ("unlike", "start", "end")),
+            scores["end"] / scores["start"],
         ]
         for settings, scores in sorted(
             ((cell["settings"], cell["scores"]) for cell in results.cells), key=lambda pair: float(pair[1]["unlike"])
         )
     ]
-    head = ["scan", "error", "cameras", "unlike", "LPIPS of the start", "of `gabor`", "ratio"]
+    head = ["scan", "error", "cameras", "unlike", "LPIPS of the start", "of the end", "ratio"]
     write_report(
         arguments.results / "agreement.md",
-        "How unlike the start is to other photographs, and what `gabor` makes of it",
+        "How unlike the start is to other photographs, and what the descent makes of it",
         results.cells,
         markdown_table(head, rows),
     )

@@ -6,9 +6,9 @@ An auxiliary image that is warped into the source view has the errors of two cam
 and its own noise. A texture that cannot be told from it is as far from the photographs as it is. So the LPIPS of these
 examples says what the adversarial loss asks for: where the texture of least L1 distance is nearer, a discriminator that
 knows all leads away from the photographs. Measured over pixels that the auxiliary view sees, with cameras as they came,
-on the study's scans (`study.py`) and on scans of one's own; `l1` and `view_selection` at the same pixels stand beside
-them. "Toned" examples have the source's mean color. Pairs are also parted by whether the preset `paper` keeps them, and
-into halves by overlap.
+on the study's scans (`study.py`) and on scans of one's own; `l1` and `view_selection_no_descent` at the same pixels
+stand beside them. "Toned" examples have the source's mean color. Pairs are also parted by whether the preset `paper`
+keeps them, and into halves by overlap.
 
 Writes examples.json (one cell per scan) and examples.md below --results; goes on with missing scans when started again.
 """
@@ -49,7 +49,7 @@ from advtex_engine.render.reproject import reproject, unproject_pixels
 from advtex_engine.render.texture import bilinear_footprint, decode_uv, sample_texels
 from advtex_engine.render.view_maps import DEPTH_TOLERANCE, ViewMaps
 
-TEXTURES = ("l1", "view_selection")
+TEXTURES = ("l1", "view_selection_no_descent")
 KEPT = {"kept": True, "left out": False}
 PARTS = ("kept", "left out", "less overlap", "more overlap")
 LEAST_PIXELS = 3_000
@@ -176,9 +176,9 @@ def report(arguments: argparse.Namespace, results: Results) -> None:
     head = ["scan", "size", "real", "real, toned", *TEXTURES, "gradients of real", "gradients of l1"]
     head += ["real over l1", *PARTS]
     note = (
-        "LPIPS against the source photographs, which `l1` and `view_selection` were made of, too. The last five columns"
+        "LPIPS against the source photographs, which `l1` and `view_selection_no_descent` were made of, too. The last"
     )
-    note += " are ratios of the real examples' to that of `l1` at the same pixels.\n\n"
+    note += " five columns are ratios of the real examples' to that of `l1` at the same pixels.\n\n"
     write_report(arguments.results / "examples.md", "Real examples", results.cells, note + markdown_table(head, rows))
 
 

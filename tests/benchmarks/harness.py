@@ -37,8 +37,9 @@ from advtex_engine.mesh.clean import clean, decimate
 from advtex_engine.mesh.models import load_model
 from advtex_engine.methods import MethodInput, texture_function
 from advtex_engine.methods.adversarial import starting_texture
-from advtex_engine.methods.gabor import descended, selected_start
+from advtex_engine.methods.gabor import descended
 from advtex_engine.methods.mean import mean_texture
+from advtex_engine.methods.selected import selected_start
 from advtex_engine.metrics.evaluate import PATCH_METRICS, VIEW_METRICS, Comparison, evaluate, score
 from advtex_engine.metrics.lpips import Lpips, WeightsError, load_lpips
 from advtex_engine.previews.live import Live

@@ -5,9 +5,9 @@
 On the study's synthetic scans (`study.py`: 256x192, 60 views) against the true object, and on scans of one's own at
 320x240 against every 8th frame, held out. Nothing is refined but the cameras of `colormap`, which is nothing without.
 Beside every row stand its LPIPS over that of `l1`, as in the paper's table of real scans, and its share of speckled
-texels over that of `view_selection`. `--rows suspects` changes the printed recipe, which speckles in 3D, one suspect at
-a time, and takes the preset's choices back one at a time; --steps 6000 tells them apart. `--rows standard full` are the
-other presets as they are, refinement included.
+texels over that of `view_selection_no_descent`. `--rows suspects` changes the printed recipe, which speckles in 3D, one
+suspect at a time, and takes the preset's choices back one at a time; --steps 6000 tells them apart. `--rows standard
+full` are the other presets as they are, refinement included.
 
 Writes paper.json (one cell per scan and row), paper.md, and a render of each, from a place that is held out, below
 --results. Stopped and run again, it goes on with the cells that are missing.
@@ -76,7 +76,7 @@ TABLE = {
     "nearest_patch": "nearest patch",
     "nearest_patch_reverse": "nearest patch, truth to texture",
     "speckle": "speckled texels",
-    "of_selection": "of view selection's",
+    "of_selection": "of selection's",
 }
 CLAIMS = {"of_l1": (0.0, 0.89), "gradient_ratio": (0.9, 1.1), "flat_energy": (0.8, 1.2), "of_selection": (0.0, 1.2)}
 """Within which the preset is to end, from MIDDLE on; OWN_OF_L1: on scans of one's own."""
@@ -104,7 +104,7 @@ METHOD_ROWS = {
         "l1",
         "sharpest",
         "colormap",
-        "view_selection",
+        "view_selection_no_descent",
         "adversarial",
         "adversarial_no_auxiliary",
         "adversarial_no_condition",
@@ -318,7 +318,7 @@ def _claims(results: Results) -> str:
         return ""
     bars = ", ".join(f"{TABLE[name]} {least:g} to {most:g}" for name, (least, most) in CLAIMS.items())
     told = f"\nThe preset's last step; **bold**: outside of what it was to show ({bars}; of l1's {OWN_OF_L1} on scans"
-    told += f" of one's own; nothing was asked of errors below {MIDDLE}). Of view selection's: speckled texels.\n\n"
+    told += f" of one's own; nothing was asked of errors below {MIDDLE}). Of selection's: speckled texels.\n\n"
     return told + markdown_table(["scan", *(TABLE[name] for name in CLAIMS)], sorted(rows))
 
 
@@ -340,7 +340,7 @@ def _pictures(cell: dict[str, Any], rows: list[str]) -> str:
 def _with_ratios(cell: dict[str, Any], here: list[dict[str, Any]]) -> dict[str, float]:
     """A cell's scores and its ratios to those rows of the same scan that were run."""
     scores = dict(cell["scores"])
-    for name, score, row in (("of_l1", "lpips", "l1"), ("of_selection", "speckle", "view_selection")):
+    for name, score, row in (("of_l1", "lpips", "l1"), ("of_selection", "speckle", "view_selection_no_descent")):
         known = [other["scores"].get(score) for other in here if other["settings"]["row"] == row]
         if known and known[0] and score in scores:
             scores[name] = scores[score] / known[0]

@@ -81,28 +81,30 @@ def _pinhole(*_: object) -> tuple[None, dict[str, Any]]:
 SELECTION, REFINE = "advtex_engine.selection", "advtex_engine.refine"
 VARIANTS = {
     "mean": Variant("mean"),
+    "no descent": Variant("view_selection_no_descent"),
+    "no descent, with whole faces": Variant(
+        "view_selection_no_descent", code={"advtex_engine.methods.selected.LONGEST_SIDE": 1e6}
+    ),
+    "no descent, without regional blur": Variant("view_selection_no_descent", code={f"{SELECTION}.detail.WEIGHT": 0.0}),
+    "no descent, without agreement": Variant(
+        "view_selection_no_descent", code={f"{SELECTION}.candidates.AGREEMENT_WEIGHT": 0.0}
+    ),
+    "no descent, without shared tones": Variant("view_selection_no_descent", code={f"{SELECTION}.tones.SCALE": 1e-6}),
+    "no descent, without back-projection": Variant(
+        "view_selection_no_descent", code={"advtex_engine.methods.selected.back_project": lambda color, *_: color}
+    ),
+    "no descent, without shared detail": Variant(
+        "view_selection_no_descent", code={"advtex_engine.methods.selected.share_detail": lambda texture, *_: texture}
+    ),
+    "no descent, without exposures": Variant(
+        "view_selection_no_descent", prepared={f"{REFINE}.run.fit_exposure": _one_exposure}
+    ),
+    "no descent, without a lens": Variant(
+        "view_selection_no_descent", prepared={f"{REFINE}.run.refine_distortion": _pinhole}
+    ),
+    "no descent, without refined geometry": Variant("view_selection_no_descent", prepared={f"{REFINE}.run.ROUNDS": 0}),
+    "no descent, without refinement": Variant("view_selection_no_descent", refine=False),
     "view selection": Variant("view_selection"),
-    "view selection with whole faces": Variant(
-        "view_selection", code={"advtex_engine.methods.view_selection.LONGEST_SIDE": 1e6}
-    ),
-    "view selection without regional blur": Variant("view_selection", code={f"{SELECTION}.detail.WEIGHT": 0.0}),
-    "view selection without agreement": Variant(
-        "view_selection", code={f"{SELECTION}.candidates.AGREEMENT_WEIGHT": 0.0}
-    ),
-    "view selection without shared tones": Variant("view_selection", code={f"{SELECTION}.tones.SCALE": 1e-6}),
-    "view selection without back-projection": Variant(
-        "view_selection", code={"advtex_engine.methods.view_selection.back_project": lambda color, *_: color}
-    ),
-    "view selection without shared detail": Variant(
-        "view_selection", code={"advtex_engine.methods.view_selection.share_detail": lambda texture, *_: texture}
-    ),
-    "view selection without exposures": Variant(
-        "view_selection", prepared={f"{REFINE}.run.fit_exposure": _one_exposure}
-    ),
-    "view selection without a lens": Variant("view_selection", prepared={f"{REFINE}.run.refine_distortion": _pinhole}),
-    "view selection without refined geometry": Variant("view_selection", prepared={f"{REFINE}.run.ROUNDS": 0}),
-    "view selection without refinement": Variant("view_selection", refine=False),
-    "gabor": Variant("gabor"),
     "the whole": Variant(),
     "without refined cameras": Variant(refine=False),
     "without refined cameras and without alignment": Variant(refine=False, changes={"alignment": False}),

@@ -79,7 +79,7 @@ def arguments_of(line: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--scenes", nargs="+", default=["room"], choices=["room", "object"])
     parser.add_argument("--sensor", default="structured", choices=["structured", "lidar"])
     parser.add_argument("--errors", nargs="+", default=list(ROWS), choices=ROWS)
-    parser.add_argument("--methods", nargs="+", default=["view_selection"])
+    parser.add_argument("--methods", nargs="+", default=["view_selection_no_descent", "view_selection"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parsed: argparse.Namespace = parser.parse_args(line)
     return parsed

@@ -4,7 +4,7 @@
         [--elsewhere SCAN …]
 
 On scans of one's own, against every 8th frame, held out. Each recipe is the preset with some of its choices made
-otherwise, from the same view selection; "awake" is a discriminator that has learned before the texture moves: He's
+otherwise, from the same selection; "awake" is a discriminator that has learned before the texture moves: He's
 start, a residual ten times as large, a quarter of the rate, and a third of the steps by itself (`learning.py` has why).
 "Learned elsewhere" is one that has learned on the scans of --elsewhere, but never on the one that it plays for then.
 Told apart are shares of patches after the pretraining, in the middle and at the end.
@@ -85,7 +85,7 @@ def sharper_pairs(given: MethodInput, maps: ViewMaps) -> Pairs:
 
 
 def widely_compared(device: torch.device) -> Any:
-    """The device's operations, with means over blocks compared beside Gabor energies, as the method `gabor` does."""
+    """The device's operations, with means over blocks compared beside Gabor energies, as `methods/gabor.py` does."""
     operations = choose_operations(device)
 
     def both(render: Tensor, photograph: Tensor, foreground: Tensor, filters: Tensor) -> Tensor:
@@ -107,8 +107,8 @@ def awake(code: dict[str, Any] | None = None, **preset: Any) -> Recipe:
 
 
 RECIPES = {
+    "no descent": Recipe("view_selection_no_descent"),
     "view selection": Recipe("view_selection"),
-    "gabor": Recipe("gabor"),
     "as it is": Recipe(),
     "without Gabor energies": Recipe(preset={"gabor_weight": 0.0}),
     "without features": Recipe(preset={"feature_weight": 0.0}),
@@ -203,7 +203,7 @@ def learned_elsewhere(arguments: argparse.Namespace, scan: Path, device: torch.d
 
 
 def fill(arguments: argparse.Namespace, results: Results) -> None:
-    """Runs every cell that is not in the results yet; all recipes of a scan begin with one view selection."""
+    """Runs every cell that is not in the results yet; all recipes of a scan begin with the same selection."""
     device = choose_device(arguments.device)
     for scan in arguments.scans:
         missing = [name for name in arguments.recipes if results.find(settings_of(arguments, scan, name)) is None]

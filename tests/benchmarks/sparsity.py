@@ -1,6 +1,6 @@
 """What sparse views cost: the same scan with every 1st, 2nd, 5th, 10th and 20th view.
 
-    python tests/benchmarks/sparsity.py [--every 1 2 5 10 20] [--methods l1 view_selection adversarial]
+    python tests/benchmarks/sparsity.py [--every 1 2 5 10 20] [--methods l1 view_selection_no_descent adversarial]
 
 Of two scans: `default`, as `advtex-engine synthesize` makes it, and `geometry`, the study's with errors of the geometry
 at its middle level. `adversarial_virtual` adds the virtual cameras that the paper's supplement D proposes for sparse
@@ -48,7 +48,7 @@ from advtex_engine.runtime.devices import choose_device
 from advtex_options.methods import known_methods
 
 VIRTUAL, PERTURBATION = "adversarial_virtual", 0.01
-SHOWN = ("l1", "view_selection", "adversarial", VIRTUAL)
+SHOWN = ("l1", "view_selection_no_descent", "adversarial", VIRTUAL)
 
 
 def arguments_of(line: list[str] | None = None) -> argparse.Namespace:

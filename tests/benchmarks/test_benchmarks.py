@@ -235,12 +235,12 @@ def test_the_errors_of_the_study_are_the_paper_s(monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.slow
 def test_cameras_that_are_turned_agree_less(tmp_path: Path, weights: Path) -> None:
-    """And what `gabor` would do is told on either side of its limit."""
+    """And what the descent would do is told on either side of its limit."""
     line = [*SMALL, "--turns", "0.3", "25", "--levels", "--lpips-weights", str(weights), "--results", str(tmp_path)]
     agreement.main(line)
     exact, wrong = (cell["scores"] for cell in json.loads((tmp_path / "agreement.json").read_text())["cells"])
     assert exact["unlike"] < gabor.UNLIKE < wrong["unlike"]
-    assert all(scores["gabor"] != scores["start"] for scores in (exact, wrong))
+    assert all(scores["end"] != scores["start"] for scores in (exact, wrong))
     assert "| cameras | 25 degrees | as they came |" in (tmp_path / "agreement.md").read_text()
 
 
@@ -297,7 +297,7 @@ def test_each_part_is_switched_off_once(
     small_desk: Path, tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(parts, "HOLDOUT", 3)
-    some = (*parts.SHOWN, "view selection without a lens")
+    some = (*parts.SHOWN, "no descent, without a lens")
     monkeypatch.setattr(parts, "VARIANTS", {name: parts.VARIANTS[name] for name in some})
     line = [str(small_desk), *SMALL, "--synthetic", "geometry", "--models", "1", "--lpips-weights", str(weights)]
     line += ["--results", str(tmp_path), "--scan-faces", "600"]
@@ -364,7 +364,7 @@ def test_the_paper_s_method_stands_beside_its_peers_and_its_suspects(
     line = [str(small_desk), "--scan-size", "96x64", "--errors", "geometry", "--levels", "1", "--steps", "2"]
     coded = [f"from the mean, {how}" for how in ("a tenth of theta_z", "fake without holes")]
     changed = ["from the mean", *coded]
-    line += ["--rows", "l1", "view_selection", "adversarial", *changed, "--device", "cpu"]
+    line += ["--rows", "l1", "view_selection_no_descent", "adversarial", *changed, "--device", "cpu"]
     line += ["--lpips-weights", str(weights), "--results", str(tmp_path / "out")]
     paper.main(line)
     found = json.loads((tmp_path / "out" / "paper.json").read_text())["cells"]
@@ -375,7 +375,8 @@ def test_the_paper_s_method_stands_beside_its_peers_and_its_suspects(
     page = (tmp_path / "out" / "paper.md").read_text()
     assert page.count("| l1 | - |") == page.count("| adversarial | 2 |") == 2
     for name in ("geometry_1_64x64", "desk_96x64"):
-        pictures = {row: f"pictures/{name}_{row}.jpg" for row in ("photograph", "l1", "view_selection", "adversarial")}
+        shown = ("photograph", "l1", "view_selection_no_descent", "adversarial")
+        pictures = {row: f"pictures/{name}_{row}.jpg" for row in shown}
         assert all(f"![{row}]({path})" in page for row, path in pictures.items())
         photograph, *renders = (cv2.imread(str(tmp_path / "out" / path)) for path in pictures.values())
         for render in renders:
@@ -465,7 +466,7 @@ def test_recipes_are_played_one_by_one(
 ) -> None:
     monkeypatch.setattr(recipes, "TextureConfig", partial(TextureConfig, refine=False))
     monkeypatch.setattr(recipes, "SCAN_FACES", 600)
-    names = ["view selection", "gabor", "as it is", "wide means compared", "awake", "awake, two scales"]
+    names = ["no descent", "view selection", "as it is", "wide means compared", "awake", "awake, two scales"]
     names += ["awake, four crops a step", "awake, the source itself, displaced"]
     line = [str(desk), "--size", "96x64", "--steps", "6", "--device", "cpu", "--recipes", *names]
     for _ in range(2):  # the second time nothing is missing

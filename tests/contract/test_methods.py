@@ -50,19 +50,27 @@ def test_names_are_told_apart() -> None:
 @pytest.mark.parametrize(
     ("asked", "preset", "chosen"),
     [
-        (None, "auto", "gabor"),
+        (None, "auto", "view_selection"),
         (None, "standard", "adversarial"),
         (None, "paper", "adversarial"),
         ("adversarial", "auto", "adversarial"),
-        ("gabor", "preview", "gabor"),
+        ("view_selection", "preview", "view_selection"),
+        ("gabor", "auto", "view_selection"),
         ("l1", "paper", "l1"),
     ],
 )
-def test_it_is_gabor_unless_a_recipe_of_the_adversarial_method_is_asked_for(
+def test_it_is_view_selection_unless_a_recipe_of_the_adversarial_method_is_asked_for(
     asked: str | None, preset: str, chosen: str
 ) -> None:
     assert chosen_method(asked, preset) == chosen
     assert chosen in known_methods()
+
+
+def test_a_job_that_was_accepted_under_an_earlier_name_is_one_still(install: Install) -> None:
+    install("other", SOUND.format(name="gabor"))
+    assert list(known_methods()) == OURS, "the name is taken"
+    assert chosen_options({"method": "gabor"}).method == "gabor"
+    assert "gabor" not in list(METHOD_HELP), "and it is not offered"
 
 
 def test_a_package_brings_a_method(install: Install) -> None:

@@ -251,7 +251,7 @@ def test_the_words_of_states_and_stages_are_the_contracts(browser: httpx.Client)
         s for s in STATES if s in TERMINAL
     ]
     assert {state for state, told in words["states"].items() if told["retryable"]} == RETRYABLE
-    assert words["usual_method"] == "gabor"
+    assert words["usual_method"] == "view_selection"
     for state, facts in STATES.items():
         assert words["states"][state]["label"] == facts.label
         assert f'<option value="{state}">{facts.label}</option>' in page

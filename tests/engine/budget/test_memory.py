@@ -217,7 +217,7 @@ def test_the_passes_before_a_game_count_where_they_need_more() -> None:
     assert fullest(replace(work, preset=PRESETS["paper"])) == estimate(replace(work, preset=PRESETS["paper"]))
 
 
-@pytest.mark.parametrize("method", ["mean", "best_view", "l1", "gabor", "vgg", "colormap"])
+@pytest.mark.parametrize("method", ["mean", "best_view", "l1", "view_selection", "vgg", "colormap"])
 def test_other_methods_have_no_discriminator(method: str) -> None:
     work = Workload(10, 320, 240, (512, 512), 100_000, method, PRESETS["standard"])
     parts = estimate(work)

@@ -23,13 +23,14 @@ from advtex_engine.core.config import PRINTED, PyramidLevel, TextureConfig
 from advtex_engine.core.errors import EngineError, Problem, Stopped
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Atlas, Camera, Mesh, Scene, View
-from advtex_engine.methods import LossPoint, MethodInput, descent, gabor, texture_function
+from advtex_engine.methods import LossPoint, MethodInput, descent, gabor, selected, texture_function
 from advtex_engine.methods.best_view import label_faces
 from advtex_engine.methods.gabor import BLOCK, PASSES, TOGETHER
 from advtex_engine.methods.mean import mean_texture
+from advtex_engine.methods.selected import select_views, selected_start, with_detail
 from advtex_engine.methods.sharpest import sharpness
 from advtex_engine.methods.vgg import WEIGHTS_VARIABLE, load_vgg
-from advtex_engine.methods.view_selection import select_views, with_detail
+from advtex_engine.methods.view_selection import view_selection
 from advtex_engine.metrics.lpips import NETWORKS, WeightsError, load_features
 from advtex_engine.pipeline import texture_scan
 from advtex_engine.previews.live import Live
@@ -140,11 +141,11 @@ def test_without_errors_every_method_finds_the_texture(name: str, around: Method
     assert (texture - truth())[seen].abs().quantile(0.99) < 0.05
 
 
-def test_view_selection_tells_where_it_shows_a_photograph_and_where_it_filled(tmp_path: Path) -> None:
+def test_selection_alone_tells_where_it_shows_a_photograph_and_where_it_filled(tmp_path: Path) -> None:
     atlas, texture = plane(), truth()
     # From close by, the view's border leaves faces of which less is seen than a photograph must show to be chosen.
     given = task(atlas, (view("near", atlas, texture, camera((0.4, 0.45, 0.5))),), tmp_path)
-    found, _ = texture_function("view_selection")(given)
+    found, _ = texture_function("view_selection_no_descent")(given)
     known, touched = given.facts["known"], given.maps[1].slot_map >= 0
     assert 0.1 < known.float().mean() < 0.9
     assert (found - texture)[known & touched].abs().quantile(0.99) < 0.05
@@ -310,7 +311,7 @@ def photographed(picture: Tensor) -> Tensor:
     return picture
 
 
-def test_gabor_keeps_what_is_sharp_and_sharpens_the_rest_where_photographs_are_displaced(
+def test_view_selection_keeps_what_is_sharp_and_sharpens_the_rest_where_photographs_are_displaced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Photographs that are off by up to two pixels, each in its own direction; one half of the start is blurred."""
@@ -338,23 +339,23 @@ def test_gabor_keeps_what_is_sharp_and_sharpens_the_rest_where_photographs_are_d
         return float(found[0] / wanted[0]), float(found[1] / wanted[1])
 
     ends = {}
-    for name in ("gabor", "l1"):
+    for name in ("view_selection", "l1"):
         config, work = TextureConfig(method=name), WorkFolder(tmp_path / name, "", Monitor())
         ends[name], _ = texture_function(name)(replace(given, config=config, work=work))
-    before, gabor_now, l1_now = (sharp(texture) for texture in (start, ends["gabor"], ends["l1"]))
-    assert gabor_now[0] > before[0] + 0.03 > before[0] > l1_now[0]
-    assert 0.97 < gabor_now[1] < 1.03
+    before, selected_now, l1_now = (sharp(texture) for texture in (start, ends["view_selection"], ends["l1"]))
+    assert selected_now[0] > before[0] + 0.03 > before[0] > l1_now[0]
+    assert 0.97 < selected_now[1] < 1.03
     assert l1_now[1] < 0.87
 
 
-def test_gabor_compares_other_windows_at_each_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_view_selection_compares_other_windows_at_each_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Crops of a size, at other places: those of a fixed grid would be fitted and not the photograph."""
     seen = list[Tensor]()
     monkeypatch.setattr(gabor, "gabor_loss", lambda render, photograph, *_: (seen.append(photograph), render.sum())[1])
     color = torch.arange(5 * 96 * 120, dtype=torch.int32).view(5, 96, 120, 1).remainder(251).expand(-1, -1, -1, 3)
     maps = planar_maps(color.to(torch.uint8).contiguous(), 120, 96)
     given = task(plane(), (view("0", plane(), truth(), camera((0.5, 0.45, 1.0))),), tmp_path, steps=30)
-    gabor.gabor(replace(given, maps={1: maps}, means={1: mean_texture(maps)}))
+    view_selection(replace(given, maps={1: maps}, means={1: mean_texture(maps)}))
     assert {tuple(photograph.shape) for photograph in seen} == {(1, 3, *reversed(crop_size(120, 96)))}
     assert len({float(photograph[0, 0, 0, 0]) for photograph in seen}) > 20
 
@@ -375,17 +376,19 @@ def test_detail_of_blurred_photographs_is_left_to_the_descent(
 ) -> None:
     views = tuple(view(f"{x}", plane(), truth(), camera((x, 0.44, 0.8), (x, 0.45, 0))) for x in (0.4, 0.6))
     given = task(plane(), views, tmp_path)
-    monkeypatch.setattr(gabor, "shows_areas", lambda _: not blurred)
+    monkeypatch.setattr(selected, "shows_areas", lambda _: not blurred)
     selection = select_views(given)
     whole = with_detail(selection.texture, selection.painted, given.maps[1])
     assert not torch.equal(whole, selection.texture)
-    texture, painted = gabor.selected_start(given, makes_detail=follows)
+    texture, painted = selected_start(given, makes_detail=follows)
     assert torch.equal(texture, selection.texture if lacks else whole)
     assert torch.equal(painted, selection.painted)
 
 
 @pytest.mark.parametrize("agree", [True, False])
-def test_gabor_leaves_a_start_that_other_photographs_have_nothing_to_say_about(tmp_path: Path, agree: bool) -> None:
+def test_view_selection_leaves_a_start_that_other_photographs_have_nothing_to_say_about(
+    tmp_path: Path, agree: bool
+) -> None:
     """Photographs of one print that are off by two pixels, and photographs of nine prints."""
     fine = torch.rand((9, 3, SIDE // 3, SIDE // 3), generator=torch.Generator().manual_seed(4))
     prints = F.interpolate(fine, (SIDE, SIDE), mode="bilinear").permute(0, 2, 3, 1)
@@ -396,7 +399,7 @@ def test_gabor_leaves_a_start_that_other_photographs_have_nothing_to_say_about(t
     given = task(plane(), (view("0", plane(), truth(), camera((0.5, 0.45, 1.0))),), tmp_path, monitor=monitor, steps=9)
     start, painted = shown[4].contiguous(), torch.full((SIDE, SIDE), 4, dtype=torch.int16)
     given = replace(given, maps={1: maps}, means={1: mean_texture(maps)}, start=start, painted=painted)
-    texture, losses = gabor.gabor(given)
+    texture, losses = view_selection(given)
     assert (gabor.start_unlikeness(given) > gabor.UNLIKE) != agree
     assert torch.equal(texture, with_detail(start, painted, maps)) != agree
     assert (monitor.codes, bool(losses)) == ([] if agree else ["photographs_disagree"], agree)
@@ -444,14 +447,14 @@ def test_the_wide_term_is_the_difference_of_means_over_blocks() -> None:
 
 
 @pytest.mark.parametrize(("cell", "texels"), [(1, 9), (3, 4)])
-def test_gabor_renders_means_over_pixels_where_photographs_are_such_means(
+def test_view_selection_renders_means_over_pixels_where_photographs_are_such_means(
     cell: int, texels: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fine = torch.rand((1, 3, SIDE // cell, SIDE // cell), generator=torch.Generator().manual_seed(4))
     picture = F.interpolate(fine, (SIDE, SIDE), mode="bilinear")[0].permute(1, 2, 0)
     maps = planar_maps((picture * 255).round().to(torch.uint8).expand(3, -1, -1, -1).contiguous(), SIDE, SIDE)
     given = task(plane(), (view("0", plane(), truth(), camera((0.5, 0.45, 1.0))),), tmp_path)
-    config = TextureConfig(method="gabor", steps=3)
+    config = TextureConfig(method="view_selection", steps=3)
     given = replace(given, maps={1: maps}, means={1: mean_texture(maps)}, start=picture, config=config)
     seen = list[int]()
 
@@ -460,11 +463,11 @@ def test_gabor_renders_means_over_pixels_where_photographs_are_such_means(
         return sample_texels(values, slots, *rest)
 
     monkeypatch.setattr(gabor, "sample_texels", sample)
-    gabor.gabor(given)
+    view_selection(given)
     assert seen == [texels] * 3 * TOGETHER
 
 
-def test_gabor_takes_what_is_wide_from_all_photographs_and_keeps_detail(
+def test_view_selection_takes_what_is_wide_from_all_photographs_and_keeps_detail(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Spots of twelve pixels that the start shows too dark, over fine print: the print is as sharp as before."""
@@ -482,9 +485,9 @@ def test_gabor_takes_what_is_wide_from_all_photographs_and_keeps_detail(
     spots = F.interpolate((torch.rand((1, 1, 8, 8), generator=generator) < 0.5).float(), (SIDE, SIDE))[0, 0, ..., None]
     start = picture - 0.05 * spots
     given = task(plane(), (view("0", plane(), truth(), camera((0.5, 0.45, 1.0))),), tmp_path)
-    config, work = TextureConfig(method="gabor"), WorkFolder(tmp_path / "gabor", "", Monitor())
+    config, work = TextureConfig(method="view_selection"), WorkFolder(tmp_path / "descended", "", Monitor())
     given = replace(given, maps={1: maps}, means={1: mean_texture(maps)}, start=start, config=config, work=work)
-    texture, _ = texture_function("gabor")(given)
+    texture, _ = texture_function("view_selection")(given)
     inner = (slice(8, -8), slice(8, -8))
 
     def wide(image: Tensor) -> Tensor:
@@ -497,9 +500,9 @@ def test_gabor_takes_what_is_wide_from_all_photographs_and_keeps_detail(
     assert 0.95 < float(slope(texture) / slope(picture)) < 1.05
 
 
-@pytest.mark.parametrize("method", ["gabor", "adversarial"])
+@pytest.mark.parametrize(("method", "module"), [("view_selection", "gabor"), ("adversarial", "adversarial")])
 def test_half_of_an_optimized_texture_s_finest_detail_is_what_photographs_share(
-    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    method: str, module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given = task(plane(), (view("0", plane(), truth(), camera((0.5, 0.45, 1.0))),), tmp_path)
     start = given.means[1]
@@ -507,7 +510,7 @@ def test_half_of_an_optimized_texture_s_finest_detail_is_what_photographs_share(
     given = replace(given, painted=torch.zeros(start.shape[:2], dtype=torch.int16))
     asked: list[tuple[Tensor, float]] = []
     monkeypatch.setattr(
-        importlib.import_module(f"advtex_engine.methods.{method}"),
+        importlib.import_module(f"advtex_engine.methods.{module}"),
         "share_detail",
         lambda texture, _, share: asked.append((texture, share)) or texture / 2,
     )
@@ -518,7 +521,7 @@ def test_half_of_an_optimized_texture_s_finest_detail_is_what_photographs_share(
     assert not torch.equal(before, start)
 
 
-def test_four_times_the_steps_of_gabor_end_near_where_the_steps_do(
+def test_four_times_the_steps_of_view_selection_end_near_where_the_steps_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its photographs are sharper than the start: with the same rate the texture would go on moving."""
@@ -532,7 +535,9 @@ def test_four_times_the_steps_of_gabor_end_near_where_the_steps_do(
 
     def moved(steps: int | None) -> float:
         work = WorkFolder(tmp_path / str(steps), "", Monitor())
-        texture, losses = gabor.gabor(replace(given, config=TextureConfig(method="gabor", steps=steps), work=work))
+        texture, losses = view_selection(
+            replace(given, config=TextureConfig(method="view_selection", steps=steps), work=work)
+        )
         assert losses[-1]["step"] == (steps or few)
         return float((texture - start).abs().mean())
 
@@ -542,11 +547,11 @@ def test_four_times_the_steps_of_gabor_end_near_where_the_steps_do(
     assert moved(few // 5) < 0.7 * usual, "few steps are not made up for by larger ones"
 
 
-def test_gabor_gives_the_same_texture_stopped_or_not(tmp_path: Path) -> None:
-    whole, losses = texture_function("gabor")(flat_task(tmp_path / "whole", steps=30)[0])
+def test_view_selection_gives_the_same_texture_stopped_or_not(tmp_path: Path) -> None:
+    whole, losses = texture_function("view_selection")(flat_task(tmp_path / "whole", steps=30)[0])
     with pytest.raises(Stopped, match="after step 11 of 30"):
-        texture_function("gabor")(flat_task(tmp_path / "parts", Stopper(11), steps=30)[0])
-    resumed, later = texture_function("gabor")(flat_task(tmp_path / "parts", steps=30)[0])
+        texture_function("view_selection")(flat_task(tmp_path / "parts", Stopper(11), steps=30)[0])
+    resumed, later = texture_function("view_selection")(flat_task(tmp_path / "parts", steps=30)[0])
     assert torch.equal(whole, resumed)
     assert losses == later
 
@@ -555,21 +560,21 @@ def test_views_of_a_step_side_by_side_are_what_they_are_one_after_the_other(tmp_
     ends = []
     for threads in (1, 2):
         with threads_each(threads):
-            ends.append(texture_function("gabor")(flat_task(tmp_path / str(threads), steps=6)[0])[0])
+            ends.append(texture_function("view_selection")(flat_task(tmp_path / str(threads), steps=6)[0])[0])
     start = flat_task(tmp_path / "start", steps=6)[0].means[1]
     assert float((ends[0] - start).abs().mean()) > 1e-3
     torch.testing.assert_close(ends[0], ends[1], atol=1e-4, rtol=0)
 
 
-def test_gabor_begins_with_the_photographs_in_the_tones_of_view_selection(tmp_path: Path) -> None:
+def test_view_selection_begins_with_the_photographs_in_the_tones_of_those_selected(tmp_path: Path) -> None:
     synthesize(tmp_path / "scan", views=8, width=128, height=96)
     shown = dict[str, MethodInput]()
 
     def keep(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
         shown["given"] = given
-        return gabor.gabor(given)
+        return view_selection(given)
 
-    config = TextureConfig(method="gabor", steps=5, face_budget=2_000, refine=False)
+    config = TextureConfig(method="view_selection", steps=5, face_budget=2_000, refine=False)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("advtex_engine.pipeline.texture_function", lambda _: keep)
         result = texture_scan(tmp_path / "scan", tmp_path / "out", config, work=tmp_path / "work")

@@ -16,7 +16,8 @@ from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Atlas, Camera, Mesh, Scene, View
 from advtex_engine.methods import MethodInput, texture_function
 from advtex_engine.methods.mean import mean_texture
-from advtex_engine.methods.view_selection import Selection, select_views, view_selection, with_detail
+from advtex_engine.methods.selected import Selection, select_views, with_detail
+from advtex_engine.methods.view_selection import view_selection_no_descent
 from advtex_engine.metrics.image_metrics import gradient_ratio
 from advtex_engine.pipeline import texture_scan
 from advtex_engine.previews.live import Live
@@ -87,8 +88,8 @@ def error(selection: Selection) -> float:
 
 
 def test_the_method_is_registered() -> None:
-    assert texture_function("view_selection") is view_selection
-    assert "view_selection" in METHOD_HELP
+    assert texture_function("view_selection_no_descent") is view_selection_no_descent
+    assert "view_selection_no_descent" in METHOD_HELP
 
 
 def test_good_photographs_give_the_truth_back(tmp_path: Path) -> None:
@@ -98,7 +99,7 @@ def test_good_photographs_give_the_truth_back(tmp_path: Path) -> None:
     assert error(selection) < 4
     assert selection.texture.shape == (SIDE, SIDE, 3)
     assert bool(((selection.texture >= 0) & (selection.texture <= 1)).all())
-    texture, losses = view_selection(asked)
+    texture, losses = view_selection_no_descent(asked)
     detailed = with_detail(selection.texture, selection.painted, asked.maps[1])
     assert torch.equal(texture, detailed), "the same input gives the same texture"
     assert error(replace(selection, texture=texture)) < error(selection)

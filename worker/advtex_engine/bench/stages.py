@@ -25,7 +25,7 @@ from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Atlas, Mesh, Scene
 from advtex_engine.methods.inputs import MethodInput
 from advtex_engine.methods.mean import mean_texture
-from advtex_engine.methods.view_selection import view_selection
+from advtex_engine.methods.view_selection import view_selection_no_descent
 from advtex_engine.previews.live import Live
 from advtex_engine.previews.turntable import FRAMES, SIZE, circle_cameras, facing, find_circle
 from advtex_engine.render.pairs import Pairs, related_pairs
@@ -114,7 +114,7 @@ def _run(scene: Scene, atlas: Atlas, timed: _Timed, device: torch.device) -> tup
             scene, atlas, {1: maps}, {1: mean}, preset, TextureConfig(), monitor, work, Live(scene, atlas, monitor)
         )
         with timed.part("view selection"):
-            texture, _ = view_selection(given)
+            texture, _ = view_selection_no_descent(given)
     with timed.part("dilation"):
         fill_holes(texture, maps.slot_map >= 0)
     with timed.part("pictures"):

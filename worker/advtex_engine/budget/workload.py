@@ -132,8 +132,8 @@ def fullest(work: Workload, on_device: int | None = None) -> dict[str, int]:
     estimates = [estimate(work, on_device)]
     if work.descends:
         pixels = math.prod(crop_size(work.width, work.height, work.preset.descent_crop))
-        passes = estimate(replace(work, method="gabor"), on_device)
-        estimates.append(passes | {"step": known_methods()["gabor"].memory.rest * pixels})
+        passes = estimate(replace(work, method="view_selection"), on_device)
+        estimates.append(passes | {"step": known_methods()["view_selection"].memory.rest * pixels})
     return max(estimates, key=lambda parts: sum(parts.values()))
 
 

@@ -1,4 +1,4 @@
-"""View selection's texture, descended to what all photographs agree on but for displacement: no opponent is trained.
+"""Selected photographs, descended to what all of them agree on but for displacement: no opponent is trained.
 
 Each step compares two views' photographs with the texture's renders by Gabor energies (`adversarial/gabor.py`), which
 forgive some pixels, so that every view adds to a texture that begins as a patchwork of single ones. Energies say
@@ -26,7 +26,7 @@ from advtex_engine.adversarial.unlikeness import structure_unlikeness
 from advtex_engine.core.errors import Problem
 from advtex_engine.methods.descent import descend, drawn_views
 from advtex_engine.methods.inputs import LossPoint, MethodInput
-from advtex_engine.methods.view_selection import select_views, with_detail
+from advtex_engine.methods.selected import with_detail
 from advtex_engine.render.sharpness import shows_areas
 from advtex_engine.render.texture import footprints, sample_texels
 from advtex_engine.render.view_maps import ViewMaps
@@ -49,15 +49,6 @@ too little in common: .09 to .48 on scans that gain by the descent, .72 to .90 w
 (`tests/benchmarks/agreement.py`)."""
 
 
-def gabor(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
-    """Two views per step, all in a new random order per pass -> [H,W,3] float32 in [0,1] and the losses.
-
-    From given.start, whose tones the views have: that of `selected_start`. It is the result, with its detail, and a
-    warning says so, where they do not agree with it. Raises Stopped, after a checkpoint.
-    """
-    return descended(given, given.config.steps)
-
-
 def descended(
     given: MethodInput,
     steps: int | None = None,
@@ -66,9 +57,11 @@ def descended(
     largest: tuple[int, int] | None = None,
     checkpoint: str = CHECKPOINT,
 ) -> tuple[Tensor, list[LossPoint]]:
-    """As `gabor`; steps: None for so many passes over all pixels. largest: crop (width, height) that a step sees.
+    """Two views per step, all in a new random order per pass -> [H,W,3] float32 in [0,1] and the losses.
 
-    checkpoint: the name of its file.
+    From given.start, whose tones the views have: that of `selected_start`. It is the result, with its detail, and a
+    warning says so, where they do not agree with it. steps: None for so many passes over all pixels. largest: crop
+    (width, height) that a step sees. checkpoint: the name of its file. Raises Stopped, after a checkpoint.
     """
     maps, device = given.maps[1], given.maps[1].device
     areas = shows_areas(maps)
@@ -115,18 +108,6 @@ def descended(
         texture, losses = descend(given, "gabor", gradient, steps, generator, rate=rate, checkpoint=checkpoint)
     # Energies say how much detail there is, and not where.
     return share_detail(texture, maps, OPTIMIZED), losses
-
-
-def selected_start(given: MethodInput, *, makes_detail: bool) -> tuple[Tensor, Tensor]:
-    """The texture [H,W,3] of view selection, and the view that each texel shows, [H,W] int16.
-
-    makes_detail: whether `descended` follows. To it the detail of photographs that are blurred is worth nothing, which
-    takes a tenth of the whole run; that of others is worth .7 % of LPIPS.
-    """
-    selection, maps = select_views(given), given.maps[1]
-    if makes_detail and not shows_areas(maps):
-        return selection.texture, selection.painted
-    return with_detail(selection.texture, selection.painted, maps), selection.painted
 
 
 def start_unlikeness(given: MethodInput) -> float:

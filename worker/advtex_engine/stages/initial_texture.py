@@ -12,8 +12,9 @@ from advtex_engine.budget.workload import Workload
 from advtex_engine.core.scene import Atlas, Scene
 from advtex_engine.methods import MethodInput
 from advtex_engine.methods.adversarial import starting_texture
-from advtex_engine.methods.gabor import descended, selected_start
+from advtex_engine.methods.gabor import descended
 from advtex_engine.methods.mean import mean_texture
+from advtex_engine.methods.selected import selected_start
 from advtex_engine.previews.live import Live
 from advtex_engine.render.view_maps import ViewMaps
 from advtex_engine.runtime.available_memory import give_back_unused

@@ -40,6 +40,7 @@ from advtex_engine.ingest.read import ingest
 from advtex_engine.mesh.models import load_model
 from advtex_engine.metrics.evaluate import VIEW_METRICS, compare, mean_scores, score
 from advtex_engine.metrics.lpips import Lpips
+from advtex_engine.metrics.photograph import Photograph
 from advtex_engine.pipeline import texture_scan
 from advtex_engine.render.pictures import encode_jpeg, to_bytes
 from advtex_engine.render.render_view import render_layers, render_view
@@ -221,8 +222,8 @@ def table(run: Run, scene: Scene, lpips: Lpips, judge: Judge | None, sheet: Path
         scores = mean_scores([score(one, lpips, VIEW_METRICS) for one in compared if one is not None])
         layers = [render_layers(atlas, texture, view.camera) for view in scene.heldout]
         exact = exact or layers
-        pairs = [(one, other, there == 1) for (one, _), (other, there) in zip(layers, exact, strict=True)]
-        apart = [lpips.masked(*pair) for pair in pairs if bool(pair[2].any())]
+        pairs = [(one, Photograph(other, there == 1)) for (one, _), (other, there) in zip(layers, exact, strict=True)]
+        apart = [lpips.masked(*pair) for pair in pairs if bool(pair[1].mask.any())]
         model = TexturedModel(atlas, texture)
         sides = f"{atlas.width}" if atlas.width == atlas.height else f"{atlas.width} x {atlas.height}"
         looks: list[object] = [scores["lpips"], scores["psnr"], sum(apart) / len(apart)]

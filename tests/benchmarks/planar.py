@@ -29,6 +29,7 @@ from advtex_engine.adversarial.examples import InputForm
 from advtex_engine.adversarial.optimizer import AdversarialOptimizer
 from advtex_engine.core.config import PRINTED
 from advtex_engine.metrics.image_metrics import nearest_patch_loss, sliced_wasserstein
+from advtex_engine.metrics.photograph import Photograph
 from advtex_engine.pipeline import choose_device
 from advtex_engine.synthetic.planar import planar_maps, planar_pairs, shifted_views
 from advtex_engine.synthetic.print import tin_side
@@ -104,14 +105,19 @@ def ratio(size: int, shift: int, steps: int, *, auxiliary: bool, seed: int = 0) 
     """Sliced Wasserstein distance of the texture's patches to the drawn truth's, over that of the L1 optimum's."""
     color, truth, l1_optimum = views_of(drawn_picture(size + 2 * shift), size, shift)
     *_, (_, texture) = optimize(color, steps, auxiliary=auxiliary, seed=seed)
-    return sliced_wasserstein(texture, truth) / sliced_wasserstein(l1_optimum, truth)
+    whole = _whole(truth)
+    return sliced_wasserstein(texture, whole) / sliced_wasserstein(l1_optimum, whole)
+
+
+def _whole(truth: Tensor) -> Photograph:
+    return Photograph(truth, torch.ones(truth.shape[:2], dtype=torch.bool))
 
 
 def scores_of(texture: Tensor, truth: Tensor) -> dict[str, float]:
     return {
         "nearest_patch": nearest_patch_loss(texture, truth, queries=QUERIES),
         "nearest_patch_reverse": nearest_patch_loss(truth, texture, queries=QUERIES),
-        "sliced_wasserstein": sliced_wasserstein(texture, truth),
+        "sliced_wasserstein": sliced_wasserstein(texture, _whole(truth)),
     }
 
 

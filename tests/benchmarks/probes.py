@@ -48,6 +48,7 @@ from advtex_engine.methods.adversarial import fitted, pairs_of
 from advtex_engine.methods.mean import dense_texture
 from advtex_engine.metrics.evaluate import score_views
 from advtex_engine.metrics.lpips import Lpips
+from advtex_engine.metrics.photograph import Photograph
 from advtex_engine.render.render_view import render_layers
 from advtex_engine.render.streaming import ResidentViews
 from advtex_engine.runtime.devices import choose_device
@@ -183,7 +184,7 @@ def _against_truth(given: MethodInput, scan: Path, lpips: Lpips) -> Score:
         found = []
         for camera, image, cover in zip(truth.cameras, truth.images, truth.covers, strict=True):
             render, seen = render_layers(given.atlas, texture, camera, supersample=SUPERSAMPLE)
-            found.append(lpips.masked(render, image, cover & (seen == 1)))
+            found.append(lpips.masked(render, Photograph(image, cover & (seen == 1))))
         return sum(found) / len(found)
 
     return score

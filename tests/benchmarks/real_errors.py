@@ -48,6 +48,7 @@ from advtex_engine.metrics.budget import corrected_tone
 from advtex_engine.metrics.evaluate import Comparison, mean_scores, score
 from advtex_engine.metrics.image_metrics import METRICS
 from advtex_engine.metrics.lpips import Lpips
+from advtex_engine.metrics.photograph import Photograph
 from advtex_engine.render.render_view import render_layers, render_view
 from advtex_engine.runtime.devices import choose_device
 from advtex_engine.synthetic.camera import Errors
@@ -166,7 +167,7 @@ def _scores(atlas: Atlas, texture: Tensor, truth: Truth, lpips: Lpips) -> dict[s
         shown = torch.where(mask[..., None], render, image)
         rows.append(score(Comparison("", image, shown, mask, mask), lpips, METRICS))
         shares.append(float(mask.sum() / cover.sum()))
-        toned.append(lpips.masked(corrected_tone(shown, image, mask), image, mask))
+        toned.append(lpips.masked(corrected_tone(shown, image, mask), Photograph(image, mask)))
     means = mean_scores([{"view": "", **row} for row in rows])
     mean = {"coverage": sum(shares) / len(shares), "lpips_toned": sum(toned) / len(toned)}
     return {**mean, **{name: means[name] for name in ("lpips", "gradient_ratio")}}

@@ -28,6 +28,7 @@ from advtex_engine.metrics.budget import (
 )
 from advtex_engine.metrics.evaluate import Scores, compare, view_budget
 from advtex_engine.metrics.lpips import Lpips
+from advtex_engine.metrics.photograph import Photograph
 from advtex_engine.refine.pose import exponential
 from advtex_engine.render.render_view import render_view
 from advtex_engine.results.export import export_model
@@ -143,7 +144,7 @@ def test_what_a_wrong_pose_costs_is_pose(photo: Tensor, lpips: Lpips) -> None:
     assert share(scores, "pose_cost") > 0.9
     assert scores["displacement_pixels"] is not None
     assert scores["displacement_pixels"] < 0.4
-    assert raw(scores) == pytest.approx(lpips.masked(given.image, given.photo, given.mask), abs=1e-9)
+    assert raw(scores) == pytest.approx(lpips.masked(given.image, Photograph(given.photo, given.mask)), abs=1e-9)
 
     elsewhere = torch.where(given.mask[..., None], color, 255 - color)
     other = replace(view, color=elsewhere)
@@ -155,7 +156,7 @@ def test_what_a_wrong_pose_costs_is_pose(photo: Tensor, lpips: Lpips) -> None:
 def test_all_costs_sum_to_the_raw_figure(photo: Tensor, lpips: Lpips) -> None:
     image = blurred(moved(vignetted(photo * 0.8), smooth_flow(2.0)))
     scores = of_image(image, photo, lpips)
-    assert raw(scores) == pytest.approx(lpips.masked(image, photo, region()), abs=1e-9)
+    assert raw(scores) == pytest.approx(lpips.masked(image, Photograph(photo, region())), abs=1e-9)
     assert all((scores[name] or 0.0) > 0 for name in ("tone_cost", "displacement_cost", "content_cost"))
     left = (scores["displacement_cost"] or 0.0) + (scores["content_cost"] or 0.0)
     assert scores["lpips_corrected"] == pytest.approx(left, abs=1e-9)

@@ -24,6 +24,7 @@ from advtex_engine.metrics.image_metrics import (
     sliced_wasserstein,
     ssim,
 )
+from advtex_engine.metrics.photograph import Photograph
 
 
 def noise(height: int = 40, width: int = 48, seed: int = 0) -> Tensor:
@@ -39,6 +40,10 @@ def everywhere(image: Tensor) -> Tensor:
     return torch.ones(image.shape[:2], dtype=torch.bool)
 
 
+def whole(image: Tensor) -> Photograph:
+    return Photograph(image, everywhere(image))
+
+
 def half(image: Tensor) -> Tensor:
     mask = everywhere(image)
     mask[:, image.shape[1] // 2 :] = False
@@ -49,23 +54,25 @@ def half(image: Tensor) -> Tensor:
 def test_equal_images_score_perfectly(name: str) -> None:
     image = noise()
     perfect = {"psnr": metrics.MAX_PSNR, "sliced_wasserstein": 0.0}.get(name, 1.0)
-    assert METRICS[name](image, image, everywhere(image)) == pytest.approx(perfect, abs=1e-5)
+    assert METRICS[name](image, whole(image)) == pytest.approx(perfect, abs=1e-5)
 
 
 @pytest.mark.parametrize("name", sorted(METRICS))
 def test_nothing_outside_the_mask_counts(name: str) -> None:
     image, truth, mask = noise(seed=1), noise(seed=2), half(noise())
-    score = METRICS[name](image, truth, mask)
-    assert METRICS[name](torch.where(mask[..., None], image, 9.0), truth, mask) == pytest.approx(score, rel=1e-4)
-    assert METRICS[name](image, torch.where(mask[..., None], truth, -3.0), mask) == pytest.approx(score, rel=1e-4)
-    assert METRICS[name](image, truth, everywhere(image)) != score
+    metric, photograph = METRICS[name], Photograph(truth, mask)
+    score = metric(image, photograph)
+    assert metric(torch.where(mask[..., None], image, 9.0), photograph) == pytest.approx(score, rel=1e-4)
+    other = Photograph(torch.where(mask[..., None], truth, -3.0), mask)
+    assert metric(image, other) == pytest.approx(score, rel=1e-4)
+    assert metric(image, whole(truth)) != score
 
 
 @given(st.floats(0.001, 0.9), st.integers(1, 30), st.integers(1, 30))
 @settings(max_examples=25, deadline=None)
 def test_psnr_of_a_constant_error(error: float, height: int, width: int) -> None:
     truth = torch.full((height, width, 3), 0.05)
-    score = psnr(truth + error, truth, everywhere(truth))
+    score = psnr(truth + error, whole(truth))
     assert score == pytest.approx(-20 * math.log10(error), abs=1e-3)
 
 
@@ -83,35 +90,35 @@ def test_ssim_is_its_definition_with_masked_weights() -> None:
         vx, vy = (w * (x[near] - mx) ** 2).sum(), (w * (y[near] - my) ** 2).sum()
         cov = (w * (x[near] - mx) * (y[near] - my)).sum()
         likeness.append((2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4)))
-    assert ssim(image, truth, mask) == pytest.approx(float(np.mean(likeness)), abs=1e-5)
+    assert ssim(image, Photograph(truth, mask)) == pytest.approx(float(np.mean(likeness)), abs=1e-5)
 
 
 def test_ssim_of_a_negative_is_negative() -> None:
     image = noise()
-    assert ssim(image, 1 - image, everywhere(image)) < -0.5
+    assert ssim(image, whole(1 - image)) < -0.5
 
 
 @pytest.mark.parametrize(("slope", "other"), [(0.01, 0.02), (0.02, 0.005), (0.01, 0.01)])
 def test_gradient_ratio_of_ramps_is_that_of_their_slopes(slope: float, other: float) -> None:
     ramp = torch.arange(40.0)[None, :, None].expand(30, 40, 3)
-    assert gradient_ratio(slope * ramp, other * ramp, everywhere(ramp)) == pytest.approx(slope / other, rel=1e-3)
+    assert gradient_ratio(slope * ramp, whole(other * ramp)) == pytest.approx(slope / other, rel=1e-3)
     down = ramp.transpose(0, 1)
-    assert gradient_ratio(slope * down, other * down, everywhere(down)) == pytest.approx(slope / other, rel=1e-3)
+    assert gradient_ratio(slope * down, whole(other * down)) == pytest.approx(slope / other, rel=1e-3)
 
 
 def test_sharpness_ratio_sees_curvature_only() -> None:
     x = torch.arange(40.0)[None, :, None].expand(30, 40, 3)
     bowl = x.square() / 1600
-    assert sharpness_ratio(bowl, bowl / 4, everywhere(bowl)) == pytest.approx(4, rel=1e-2)
-    assert sharpness_ratio(x / 40, bowl, everywhere(bowl)) < 0.01
+    assert sharpness_ratio(bowl, whole(bowl / 4)) == pytest.approx(4, rel=1e-2)
+    assert sharpness_ratio(x / 40, whole(bowl)) < 0.01
 
 
 @pytest.mark.parametrize("ratio", [gradient_ratio, sharpness_ratio])
 def test_blur_lowers_the_ratios_and_flat_pairs_have_one(ratio: Callable[..., float]) -> None:
     image, flat = noise(), torch.full((30, 30, 3), 0.4)
-    assert ratio(blurred(image), image, everywhere(image)) < 0.4
-    assert ratio(image, blurred(image), everywhere(image)) > 2.5
-    assert ratio(flat, flat + 0.1, everywhere(flat)) == pytest.approx(1, abs=0.05)
+    assert ratio(blurred(image), whole(image)) < 0.4
+    assert ratio(image, whole(blurred(image))) > 2.5
+    assert ratio(flat, whole(flat + 0.1)) == pytest.approx(1, abs=0.05)
 
 
 def brute_nearest(image: Tensor, truth: Tensor) -> float:
@@ -162,13 +169,13 @@ def test_a_few_queries_estimate_the_nearest_patch_loss() -> None:
 def test_sliced_wasserstein_of_constant_images() -> None:
     flat = torch.full((20, 20, 3), 0.3)
     # Along a unit vector d the shift is 25.5 times the sum of d, whose mean magnitude is sqrt(2 / pi).
-    assert sliced_wasserstein(flat + 0.1, flat) == pytest.approx(25.5 * math.sqrt(2 / math.pi), rel=0.15)
+    assert sliced_wasserstein(flat + 0.1, whole(flat)) == pytest.approx(25.5 * math.sqrt(2 / math.pi), rel=0.15)
 
 
 def test_sliced_wasserstein_forgives_shifts_and_not_blur() -> None:
     truth = noise(64, 64)
-    shifted = truth.roll((9, 14), (0, 1))
-    assert sliced_wasserstein(shifted, truth) < 0.1 * sliced_wasserstein(blurred(truth), truth)
+    shift, blur = (sliced_wasserstein(one, whole(truth)) for one in (truth.roll((9, 14), (0, 1)), blurred(truth)))
+    assert shift < 0.1 * blur
 
 
 def test_sliced_wasserstein_is_its_definition() -> None:
@@ -182,20 +189,20 @@ def test_sliced_wasserstein_is_its_definition() -> None:
 
     ordered = [np.sort(directions @ patches(picture).T, axis=1) for picture in (image, truth)]
     expected = float(np.abs(ordered[0] - ordered[1]).mean())
-    assert sliced_wasserstein(image, truth) == pytest.approx(expected, rel=0.1)
+    assert sliced_wasserstein(image, whole(truth)) == pytest.approx(expected, rel=0.1)
 
 
 def test_sliced_wasserstein_of_some_patches_estimates_that_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
     image, truth = blurred(noise(80, 90, 1)), noise(80, 90, 2)
-    whole = sliced_wasserstein(image, truth)
+    every = sliced_wasserstein(image, whole(truth))
     monkeypatch.setattr(metrics, "MAX_PATCHES", 2000)
-    assert sliced_wasserstein(image, truth) == pytest.approx(whole, rel=0.03)
-    assert sliced_wasserstein(truth, truth) == 0
+    assert sliced_wasserstein(image, whole(truth)) == pytest.approx(every, rel=0.03)
+    assert sliced_wasserstein(truth, whole(truth)) == 0
 
 
 def test_sliced_wasserstein_without_a_whole_patch_is_nan() -> None:
     image = noise()
-    assert math.isnan(sliced_wasserstein(image, image, ~everywhere(image)))
+    assert math.isnan(sliced_wasserstein(image, Photograph(image, ~everywhere(image))))
 
 
 @given(st.integers(1, 12), st.integers(1, 12), st.integers(0, 3), st.integers(0, 2**31))
@@ -214,7 +221,7 @@ def test_score_views_averages_the_views_that_show_something() -> None:
     scores = score_views([first, second, first], [truth] * 3, [full, full, nothing])
     assert scores["views"] == 2
     for name, metric in METRICS.items():
-        expected = (metric(first, truth, full) + metric(second, truth, full)) / 2
+        expected = (metric(first, Photograph(truth, full)) + metric(second, Photograph(truth, full))) / 2
         assert scores[name] == pytest.approx(expected, rel=1e-5)
     assert score_views([first], [truth], [nothing]) == {}
 

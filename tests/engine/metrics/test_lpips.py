@@ -31,6 +31,7 @@ from advtex_engine.metrics.lpips import (
     load_lpips,
     weights_folder,
 )
+from advtex_engine.metrics.photograph import Photograph
 
 WEIGHTS = Path(os.environ.get("ADVTEX_DATA", Path(__file__).parents[3].parent / "shared" / "data")) / "weights"
 needs_weights = [pytest.mark.data, pytest.mark.skipif(not WEIGHTS.is_dir(), reason=f"no network weights at {WEIGHTS}")]
@@ -162,12 +163,12 @@ def test_what_lies_outside_of_the_mask_is_context_only(lpips: Lpips) -> None:
     image, truth = picture(seed=1), picture(seed=2)
     mask = torch.zeros(truth.shape[:2], dtype=torch.bool)
     mask[20:50, 20:60] = True
-    changed = torch.where(mask[..., None], image, 9.0)
-    assert lpips.masked(changed, truth, mask) == lpips.masked(image, truth, mask)
-    assert lpips.masked(image, truth, mask) > lpips.on_black(image, truth, mask) > 0
-    everywhere = torch.ones_like(mask)
-    assert lpips.masked(image, truth, everywhere) == pytest.approx(float(lpips(image, truth)[1].mean()), rel=1e-5)
-    assert lpips.on_black(image, truth, everywhere) == lpips(image, truth)[0]
+    changed, inside = torch.where(mask[..., None], image, 9.0), Photograph(truth, mask)
+    assert lpips.masked(changed, inside) == lpips.masked(image, inside)
+    assert lpips.masked(image, inside) > lpips.on_black(image, inside) > 0
+    everywhere = Photograph(truth, torch.ones_like(mask))
+    assert lpips.masked(image, everywhere) == pytest.approx(float(lpips(image, truth)[1].mean()), rel=1e-5)
+    assert lpips.on_black(image, everywhere) == lpips(image, truth)[0]
 
 
 # Published values ----------------------------------------------------------------------------------------------------

@@ -13,9 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from advtex_engine.metrics.photograph import Photograph
 from advtex_engine.metrics.sharpness import FLAT_PIXELS, band_error, flat_energy, flat_pixels, s3_map, s3_ratio
 
-Measure = Callable[[Tensor, Tensor, Tensor], float]
+Measure = Callable[[Tensor, Photograph], float]
 GRAY = np.array([0.299, 0.587, 0.114])
 
 
@@ -37,6 +38,10 @@ def blurred(image: Tensor, sigma: float = 1.5) -> Tensor:
 
 def everywhere(image: Tensor) -> Tensor:
     return torch.ones(image.shape[:2], dtype=torch.bool)
+
+
+def whole(image: Tensor) -> Photograph:
+    return Photograph(image, everywhere(image))
 
 
 def blob(height: int, width: int) -> Tensor:
@@ -70,16 +75,15 @@ def band_twin(image: Tensor, truth: Tensor, mask: Tensor) -> float:
 def test_band_error_is_its_definition(height: int, width: int) -> None:
     image, truth = blurred(natural(height, width, 1)), natural(height, width, 2)
     for mask in (everywhere(truth), blob(height, width)):
-        assert band_error(image, truth, mask) == pytest.approx(band_twin(image, truth, mask), rel=1e-3)
+        assert band_error(image, Photograph(truth, mask)) == pytest.approx(band_twin(image, truth, mask), rel=1e-3)
 
 
 def test_band_error_forgives_shifts_and_sees_blur_and_noise() -> None:
     truth = natural(192, 224)
-    mask = everywhere(truth)
-    shift = band_error(truth.roll((2, 3), (0, 1)), truth, mask)
-    assert band_error(truth, truth, mask) == 0
-    assert band_error(blurred(truth), truth, mask) > 3 * shift
-    assert band_error(truth + 0.3 * (noise(192, 224, 5) - 0.5), truth, mask) > 3 * shift
+    shift = band_error(truth.roll((2, 3), (0, 1)), whole(truth))
+    assert band_error(truth, whole(truth)) == 0
+    assert band_error(blurred(truth), whole(truth)) > 3 * shift
+    assert band_error(truth + 0.3 * (noise(192, 224, 5) - 0.5), whole(truth)) > 3 * shift
 
 
 @given(st.floats(0.3, 3.0))
@@ -87,7 +91,7 @@ def test_band_error_forgives_shifts_and_sees_blur_and_noise() -> None:
 def test_band_error_of_a_change_of_contrast_is_its_logarithm(contrast: float) -> None:
     truth = noise(64, 64)
     image = 0.5 + contrast * (truth - 0.5)
-    assert band_error(image, truth, everywhere(truth)) == pytest.approx(abs(math.log(contrast)), rel=0.05, abs=1e-3)
+    assert band_error(image, whole(truth)) == pytest.approx(abs(math.log(contrast)), rel=0.05, abs=1e-3)
 
 
 # S3 ------------------------------------------------------------------------------------------------------------------
@@ -129,16 +133,15 @@ def test_s3_is_its_definition() -> None:
 
 def test_s3_ratio_falls_with_blur_and_counts_blocks_in_the_mask_only() -> None:
     truth = natural()
-    mask = everywhere(truth)
-    ratios = [s3_ratio(blurred(truth, sigma), truth, mask) for sigma in (0.6, 1.0, 2.0)]
+    ratios = [s3_ratio(blurred(truth, sigma), whole(truth)) for sigma in (0.6, 1.0, 2.0)]
     assert 1 > ratios[0] > ratios[1] > ratios[2]
-    assert s3_ratio(truth, truth, mask) == 1
+    assert s3_ratio(truth, whole(truth)) == 1
     left = everywhere(truth)
     left[:, 60:] = False
     half = truth.clone()
     half[:, 64:] = 0
-    assert s3_ratio(half, truth, left) == 1
-    assert math.isnan(s3_ratio(truth, truth, ~mask))
+    assert s3_ratio(half, Photograph(truth, left)) == 1
+    assert math.isnan(s3_ratio(truth, Photograph(truth, ~everywhere(truth))))
 
 
 # Flat surfaces -------------------------------------------------------------------------------------------------------
@@ -165,48 +168,49 @@ def test_flat_pixels_are_the_wall_away_from_its_poster() -> None:
 
 def test_flat_energy_takes_the_photographs_noise_for_the_reference() -> None:
     photo, other = wall(1.5, 1), wall(1.5, 2)
-    mask = everywhere(photo)
-    assert flat_energy(photo, photo, mask) == 1
-    assert flat_energy(other, photo, mask) == pytest.approx(1, abs=0.03)
-    assert flat_energy(wall(0.0), photo, mask) < 0.1
-    assert flat_energy(wall(3.0, 2), photo, mask) == pytest.approx(2, rel=0.05)
+    truth = whole(photo)
+    assert flat_energy(photo, truth, truth.mask) == 1
+    assert flat_energy(other, truth, truth.mask) == pytest.approx(1, abs=0.03)
+    assert flat_energy(wall(0.0), truth, truth.mask) < 0.1
+    assert flat_energy(wall(3.0, 2), truth, truth.mask) == pytest.approx(2, rel=0.05)
 
 
 def test_flat_energy_sees_ringing_and_seams_on_the_wall_only() -> None:
     photo = wall()
-    mask = everywhere(photo)
+    truth = whole(photo)
     rings = 0.01 * torch.cos(torch.arange(160.0) * 2 * math.pi / 5)[None, :, None]
-    assert flat_energy(photo + rings, photo, mask) > 1.5
+    assert flat_energy(photo + rings, truth, truth.mask) > 1.5
     seam = photo.clone()
     seam[:, 110:] += 0.05
-    assert flat_energy(seam, photo, mask) > 1.2
+    assert flat_energy(seam, truth, truth.mask) > 1.2
     poster = photo.clone()
     poster[24:56, 25:65] += 0.3 * noise(32, 40, 3)
-    assert flat_energy(poster, photo, mask) == pytest.approx(1, abs=0.01)
+    assert flat_energy(poster, truth, truth.mask) == pytest.approx(1, abs=0.01)
     exposed = photo * 1.02 + 0.05
-    assert flat_energy(exposed, photo, mask) == pytest.approx(1.02, abs=0.01)
+    assert flat_energy(exposed, truth, truth.mask) == pytest.approx(1.02, abs=0.01)
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0])
 def test_flat_energy_leaves_out_what_the_photograph_clips(level: float) -> None:
     photo = wall()
     photo[:, 80:] = level
+    truth = whole(photo)
     image = photo + 0.02 * (noise(120, 160) - 0.5) * (torch.arange(160) >= 90)[None, :, None]
-    assert flat_energy(image, photo, everywhere(photo)) == pytest.approx(1, abs=0.01)
+    assert flat_energy(image, truth, truth.mask) == pytest.approx(1, abs=0.01)
 
 
 def test_flat_energy_says_nothing_without_flat_pixels() -> None:
-    busy = noise()
-    assert math.isnan(flat_energy(busy, busy, everywhere(busy)))
+    busy = whole(noise())
+    assert math.isnan(flat_energy(busy.color, busy, busy.mask))
     photo = wall()
     mask = ~everywhere(photo)
     mask[70:106, 20:50] = True
     assert 0 < int(flat_pixels(photo, mask).sum()) < FLAT_PIXELS
-    assert math.isnan(flat_energy(photo, photo, mask))
+    assert math.isnan(flat_energy(photo, Photograph(photo, mask), mask))
 
 
-@pytest.mark.parametrize("measure", [band_error, s3_ratio, flat_energy])
+@pytest.mark.parametrize("measure", [band_error, s3_ratio, lambda image, truth: flat_energy(image, truth, truth.mask)])
 def test_bytes_of_other_shapes_are_refused(measure: Measure) -> None:
     image = natural()
     with pytest.raises(AssertionError):
-        measure(image[:-1], image, everywhere(image))
+        measure(image[:-1], whole(image))

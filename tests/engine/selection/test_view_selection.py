@@ -19,6 +19,7 @@ from advtex_engine.methods.mean import mean_texture
 from advtex_engine.methods.selected import Selection, select_views, with_detail
 from advtex_engine.methods.view_selection import view_selection_no_descent
 from advtex_engine.metrics.image_metrics import gradient_ratio
+from advtex_engine.metrics.photograph import Photograph
 from advtex_engine.pipeline import texture_scan
 from advtex_engine.previews.live import Live
 from advtex_engine.render.render_view import render_layers, render_view
@@ -185,7 +186,7 @@ def test_resting_on_one_view_keeps_its_sharpness(tmp_path: Path) -> None:
     photo = photograph(atlas, shot).float() / 255
     mask = torch.zeros((HEIGHT, WIDTH), dtype=torch.bool)
     mask[30:100, 40:120] = True
-    assert 0.85 < gradient_ratio(render, photo, mask) < 1.15
+    assert 0.85 < gradient_ratio(render, Photograph(photo, mask)) < 1.15
 
 
 @pytest.mark.data

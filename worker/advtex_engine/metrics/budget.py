@@ -31,7 +31,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from advtex_engine.metrics.image_metrics import gradient_magnitude, luminance
-from advtex_engine.metrics.lpips import Against, Lpips
+from advtex_engine.metrics.lpips import Lpips
+from advtex_engine.metrics.photograph import Photograph
 from advtex_engine.refine.exposure import BRIGHT, DARK, GAIN_RANGE, ROBUST_SCALE
 from advtex_engine.render.texture import fill_holes
 from advtex_engine.selection.toning import LARGEST, REACH
@@ -76,7 +77,8 @@ def budget_scores(
     moved = warped(toned, flow, known)
     scores: dict[str, float | None] = dict.fromkeys((*LPIPS_SCORES, "displacement_pixels"))
     if lpips is not None:
-        raw, after_pose, corrected, after_flow = map(Against(lpips, photo, mask).masked, (image, posed, toned, moved))
+        truth = Photograph(photo, mask)
+        raw, after_pose, corrected, after_flow = (lpips.masked(one, truth) for one in (image, posed, toned, moved))
         costs = (raw - after_pose, after_pose - corrected, corrected - after_flow, after_flow)
         scores |= {"lpips_corrected": corrected, **dict(zip(COSTS, costs, strict=True))}
     if bool(known.any()):

@@ -26,7 +26,8 @@ from advtex_engine.ingest.read import load_scene, opened, sound_scan
 from advtex_engine.mesh.models import load_model, load_reference
 from advtex_engine.metrics.budget import LPIPS_SCORES, budget_scores
 from advtex_engine.metrics.image_metrics import METRICS, nearest_patch_loss
-from advtex_engine.metrics.lpips import Against, Lpips, WeightsError, load_lpips
+from advtex_engine.metrics.lpips import Lpips, WeightsError, load_lpips
+from advtex_engine.metrics.photograph import Photograph
 from advtex_engine.metrics.sharpness import band_error, flat_energy, s3_ratio
 from advtex_engine.refine.heldout import refine_heldout
 from advtex_engine.render.pictures import contact_sheet
@@ -48,12 +49,14 @@ SHEET_VIEWS = 12
 # What the patches of a view take while it is scored, and all else by its size; 300 MB were seen at 640x480.
 BYTES_PER_SCORED_VIEW, BYTES_PER_SCORED_PIXEL = 270 << 20, 400
 
-Metric = Callable[[Tensor, Tensor, Tensor], float]
+Metric = Callable[[Tensor, Photograph], float]
 
 VIEW_METRICS: dict[str, Metric] = {**METRICS, "band_error": band_error, "s3_ratio": s3_ratio}
 PATCH_METRICS: dict[str, Metric] = {
-    "nearest_patch": lambda image, photo, mask: nearest_patch_loss(image, photo, mask, queries=PATCH_QUERIES),
-    "nearest_patch_reverse": lambda image, photo, mask: nearest_patch_loss(photo, image, mask, queries=PATCH_QUERIES),
+    "nearest_patch": lambda image, truth: nearest_patch_loss(image, truth.color, truth.mask, queries=PATCH_QUERIES),
+    "nearest_patch_reverse": lambda image, truth: nearest_patch_loss(
+        truth.color, image, truth.mask, queries=PATCH_QUERIES
+    ),
 }
 Scores = dict[str, float | None]
 
@@ -214,18 +217,20 @@ def _look(atlas: Atlas, view: View, reference: Mesh | None = None) -> _Looked | 
     return _Looked(view, mask, covered, gbuffer(atlas, view.camera, _supersample(atlas, fragments)))
 
 
-def score(comparison: Comparison, lpips: Lpips | Against | None, metrics: dict[str, Metric]) -> Scores:
+def score(
+    comparison: Comparison, lpips: Lpips | None, metrics: dict[str, Metric], truth: Photograph | None = None
+) -> Scores:
     """All scores of a view; None where a metric says nothing (no weights, no flat pixels).
 
-    lpips: may be that against the comparison's photograph and mask.
+    truth: the comparison's photograph and mask, where more is compared with them.
     """
-    image, photo, mask = comparison.image, comparison.photo, comparison.mask
+    image, mask = comparison.image, comparison.mask
+    truth = Photograph(comparison.photo, mask) if truth is None else truth
     scores: Scores = {"lpips": None, "lpips_full": None}
     if lpips is not None:
-        against = lpips if isinstance(lpips, Against) else Against(lpips, photo, mask)
-        scores = {"lpips": against.masked(image), "lpips_full": against.on_black(image)}
-    scores |= {name: metric(image, photo, mask) for name, metric in metrics.items()}
-    scores["flat_energy"] = flat_energy(image, photo, comparison.covered)
+        scores = {"lpips": lpips.masked(image, truth), "lpips_full": lpips.on_black(image, truth)}
+    scores |= {name: metric(image, truth) for name, metric in metrics.items()}
+    scores["flat_energy"] = flat_energy(image, truth, comparison.covered)
     scores["coverage"] = float(comparison.covered.sum() / mask.sum())
     scores["mask_share"] = float(mask.to(torch.float32).mean())
     return {name: None if value is None or math.isnan(value) else value for name, value in scores.items()}
@@ -254,8 +259,8 @@ def score_views(
         looked = _look(atlas, view)
         if looked is None:
             return None
-        against = None if lpips is None else Against(lpips, looked.photo, looked.mask)
-        return {name: score(looked.shows(texture), against, VIEW_METRICS) for name, texture in textures.items()}
+        truth = Photograph(looked.photo, looked.mask)
+        return {name: score(looked.shows(texture), lpips, VIEW_METRICS, truth) for name, texture in textures.items()}
 
     pixels = max((view.camera.width * view.camera.height for view in views), default=1)
     room = available_memory(torch.device("cpu")) // 2

@@ -1,8 +1,9 @@
 """How a render differs from a photograph, and a texture from the truth; `sharpness.py` has the spectral measures.
 
-Images are [H,W,3] float sRGB in [0,1]; masks are [H,W] bool and say which pixels count. Nothing here is used in the
-optimization. PSNR and SSIM assume perfect alignment and prefer a blurred image to a sharp one that is a pixel off: on
-real scans read the gradient ratio and the distance between patch statistics first, and look.
+Images are [H,W,3] float sRGB in [0,1]; masks are [H,W] bool and say which pixels count. What depends on the truth alone
+is found once for all images that are compared with it (`Photograph.once`). Nothing here is used in the optimization.
+PSNR and SSIM assume perfect alignment and prefer a blurred image to a sharp one that is a pixel off: on real scans read
+the gradient ratio and the distance between patch statistics first, and look.
 """
 
 from __future__ import annotations
@@ -13,7 +14,11 @@ from collections.abc import Iterable
 import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor
+
+from advtex_engine.metrics.photograph import Photograph
+from advtex_engine.render.filtering import window_sums
 
 LUMINANCE = (0.299, 0.587, 0.114)
 PATCH = 7
@@ -34,59 +39,72 @@ PATCH_BLOCK = 1 << 16
 """Patches of the truth that are held at once: its columns."""
 
 
-def psnr(image: Tensor, truth: Tensor, mask: Tensor) -> float:
+def psnr(image: Tensor, truth: Photograph) -> float:
     """Peak signal-to-noise ratio in dB over the mask."""
-    _check(image, truth, mask)
-    error = float((image - truth)[mask].double().square().mean())
+    assert image.shape == truth.color.shape
+    error = float((image - truth.color)[truth.mask].double().square().mean())
     return min(MAX_PSNR, -10 * math.log10(max(error, 1e-30)))
 
 
-def ssim(image: Tensor, truth: Tensor, mask: Tensor) -> float:
+def ssim(image: Tensor, truth: Photograph) -> float:
     """Structural similarity (Wang et al. 2004) of the luminance, Gaussian window, mean over the mask.
 
     The window's weights are those of the masked pixels alone, so nothing outside the mask has any influence.
     """
-    _check(image, truth, mask)
-    x, y, weight = luminance(image), luminance(truth), mask.to(torch.float32)
-    offset = torch.arange(SSIM_WINDOW, dtype=torch.float32, device=image.device) - SSIM_WINDOW // 2
-    window = torch.exp(-offset.square() / (2 * SSIM_SIGMA**2))
-    window = window / window.sum()
-
-    def smooth(values: Tensor) -> Tensor:
-        planes = values[None, None]
-        rows = F.conv2d(planes, window.view(1, 1, -1, 1), padding=(SSIM_WINDOW // 2, 0))
-        return F.conv2d(rows, window.view(1, 1, 1, -1), padding=(0, SSIM_WINDOW // 2))[0, 0]
-
-    share = smooth(weight).clamp(min=1e-8)
-    mean_x, mean_y = smooth(x * weight) / share, smooth(y * weight) / share
-    variance_x = smooth(x * x * weight) / share - mean_x.square()
-    variance_y = smooth(y * y * weight) / share - mean_y.square()
-    covariance = smooth(x * y * weight) / share - mean_x * mean_y
+    assert image.shape == truth.color.shape
+    share = truth.once(_window_share)
+    (x, mean_x, square_x), (y, mean_y, square_y) = _window_means(image, truth.mask), truth.once(_window_means)
+    mean_x, mean_y = mean_x / share, mean_y / share
+    variance_x, variance_y = square_x / share - mean_x.square(), square_y / share - mean_y.square()
+    covariance = _windowed(x * y * truth.mask) / share - mean_x * mean_y
     likeness = ((2 * mean_x * mean_y + SSIM_C1) * (2 * covariance + SSIM_C2)) / (
         (mean_x.square() + mean_y.square() + SSIM_C1) * (variance_x + variance_y + SSIM_C2)
     )
-    return float(likeness[mask].mean())
+    return float(likeness[truth.mask].mean())
 
 
-def gradient_ratio(image: Tensor, truth: Tensor, mask: Tensor) -> float:
+def _window_share(_: Tensor, mask: Tensor) -> Tensor:
+    return _windowed(mask.to(torch.float32)).clamp(min=1e-8)
+
+
+def _window_means(image: Tensor, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The luminance, and under the window its mean and that of its square, both times the mask's share; [H,W] each."""
+    plane = luminance(image)
+    return plane, _windowed(plane * mask), _windowed(plane * plane * mask)
+
+
+def _windowed(plane: Tensor) -> Tensor:
+    """A plane [H,W] under SSIM's window; outside there is nothing."""
+    offset = torch.arange(SSIM_WINDOW, dtype=torch.float32, device=plane.device) - SSIM_WINDOW // 2
+    window = torch.exp(-offset.square() / (2 * SSIM_SIGMA**2))
+    window = window / window.sum()
+    rows = F.conv2d(plane[None, None], window.view(1, 1, -1, 1), padding=(SSIM_WINDOW // 2, 0))
+    return F.conv2d(rows, window.view(1, 1, 1, -1), padding=(0, SSIM_WINDOW // 2))[0, 0]
+
+
+def gradient_ratio(image: Tensor, truth: Photograph) -> float:
     """Mean luminance gradient (Sobel) of the image over that of the truth: below 1 blurred, above 1 noisy or seamy.
 
     Counts pixels whose whole 5x5 neighborhood lies in the mask; 1 when neither image has a gradient there.
     """
-    _check(image, truth, mask)
-    inside = eroded(mask, GRADIENT_MARGIN)
-    ours, theirs = (float(gradient_magnitude(luminance(picture))[inside].mean()) for picture in (image, truth))
-    return (ours + 1e-6) / (theirs + 1e-6)
+    assert image.shape == truth.color.shape
+    return (_gradient(image, truth.mask) + 1e-6) / (truth.once(_gradient) + 1e-6)
 
 
-def sharpness_ratio(image: Tensor, truth: Tensor, mask: Tensor) -> float:
+def _gradient(image: Tensor, mask: Tensor) -> float:
+    return float(gradient_magnitude(luminance(image))[eroded(mask, GRADIENT_MARGIN)].mean())
+
+
+def sharpness_ratio(image: Tensor, truth: Photograph) -> float:
     """Mean magnitude of the luminance's Laplacian, image over truth: the finest detail alone; otherwise as
     `gradient_ratio`."""
-    _check(image, truth, mask)
-    inside = eroded(mask, GRADIENT_MARGIN)
+    assert image.shape == truth.color.shape
+    return (_laplacian(image, truth.mask) + 1e-6) / (truth.once(_laplacian) + 1e-6)
+
+
+def _laplacian(image: Tensor, mask: Tensor) -> float:
     kernel = image.new_tensor([[0.0, 1.0, 0.0], [1.0, -4.0, 1.0], [0.0, 1.0, 0.0]])
-    ours, theirs = (float(_filtered(luminance(picture), kernel).abs()[inside].mean()) for picture in (image, truth))
-    return (ours + 1e-6) / (theirs + 1e-6)
+    return float(_filtered(luminance(image), kernel).abs()[eroded(mask, GRADIENT_MARGIN)].mean())
 
 
 def nearest_patch_loss(
@@ -117,25 +135,30 @@ def nearest_patch_loss(
     return total / len(ours) / math.sqrt(PATCH * PATCH * 3)
 
 
-def sliced_wasserstein(image: Tensor, truth: Tensor, mask: Tensor | None = None, *, seed: int = 0) -> float:
+def sliced_wasserstein(image: Tensor, truth: Photograph) -> float:
     """Sliced Wasserstein-1 distance between the images' distributions of 7x7 patches, in levels of 0 to 255.
 
     Patches become vectors of 147 numbers; along each of PROJECTIONS random unit vectors both sets are sorted and the
     mean absolute difference is taken. Where things lie does not matter, only what they look like: blur and noise
-    show, a shift does not. mask: patches count that lie in it entirely. NaN when there is none.
+    show, a shift does not. Patches count that lie in the mask entirely. NaN when there is none.
     """
-    assert image.shape == truth.shape
-    corners = _patch_corners(image, mask, MAX_PATCHES, seed)
-    if len(corners) == 0:
+    assert image.shape == truth.color.shape
+    ours, theirs = _sorted_patches(image, truth.mask), truth.once(_sorted_patches)
+    if ours.size == 0:
         return math.nan
-    generator = torch.Generator().manual_seed(seed)
-    directions = torch.randn(PATCH * PATCH * 3, PROJECTIONS, generator=generator).to(image.device)
-    directions = directions / directions.norm(dim=0)
-    ours, theirs = ((directions.T @ _patches(picture, corners).T).cpu().numpy() for picture in (image, truth))
-    for values in (ours, theirs):  # NumPy sorts float32 ten times as fast as torch on a CPU
-        values.sort(axis=1)
     ours -= theirs
     return float(np.abs(ours, out=ours).mean())
+
+
+def _sorted_patches(image: Tensor, mask: Tensor) -> NDArray[np.float32]:
+    """[PROJECTIONS,N]: patches along each of the vectors, in ascending order."""
+    corners = _patch_corners(image, mask, MAX_PATCHES)
+    directions = torch.randn(PATCH * PATCH * 3, PROJECTIONS, generator=torch.Generator().manual_seed(0))
+    directions = directions.to(image.device)
+    directions = directions / directions.norm(dim=0)
+    values: NDArray[np.float32] = (directions.T @ _patches(image, corners).T).cpu().numpy()
+    values.sort(axis=1)  # NumPy sorts float32 ten times as fast as torch on a CPU
+    return values
 
 
 METRICS = {
@@ -156,8 +179,8 @@ def score_views(renders: Iterable[Tensor], photos: Iterable[Tensor], masks: Iter
     for render, photo, mask in zip(renders, photos, masks, strict=True):
         if not bool(eroded(mask, PATCH // 2).any()):
             continue
-        pair = (_unit(render), _unit(photo).to(render.device))
-        scores.append({name: metric(*pair, mask.to(render.device)) for name, metric in METRICS.items()})
+        image, truth = _unit(render), Photograph(_unit(photo).to(render.device), mask.to(render.device))
+        scores.append({name: metric(image, truth) for name, metric in METRICS.items()})
     if not scores:
         return {}
     means = {name: sum(score[name] for score in scores) / len(scores) for name in METRICS}
@@ -166,15 +189,8 @@ def score_views(renders: Iterable[Tensor], photos: Iterable[Tensor], masks: Iter
 
 def eroded(mask: Tensor, radius: int) -> Tensor:
     """Pixels [H,W] bool whose whole (2 radius + 1)^2 neighborhood lies inside the image and the mask."""
-    outside = F.pad((~mask).to(torch.float32), (radius,) * 4, value=1.0)
-    side = 2 * radius + 1
-    across = F.max_pool2d(outside[None], (1, side), stride=1)
-    return F.max_pool2d(across, (side, 1), stride=1)[0] == 0
-
-
-def _check(image: Tensor, truth: Tensor, mask: Tensor) -> None:
-    assert image.shape == truth.shape == (*mask.shape, 3)
-    assert mask.dtype == torch.bool
+    # Sums by runs take a CPU a fifteenth of what pooling does.
+    return window_sums(mask.to(torch.int16)[None], radius)[0] == (2 * radius + 1) ** 2
 
 
 def _unit(image: Tensor) -> Tensor:

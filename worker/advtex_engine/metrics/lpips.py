@@ -12,7 +12,6 @@ import os
 import urllib.request
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from advtex_engine.core.errors import EngineError
+from advtex_engine.metrics.photograph import Photograph
 from advtex_engine.runtime.files import atomic_file
 
 WEIGHTS_VARIABLE = "ADVTEX_LPIPS_WEIGHTS"
@@ -166,65 +166,44 @@ class Lpips:
         return whole[:, 0]
 
     @torch.no_grad()
-    def features(self, image: Tensor) -> list[Tensor]:
+    def __call__(self, image: Tensor, truth: Tensor) -> tuple[float, Tensor]:
+        """Two images [H,W,3] sRGB in [0,1] -> the distance as published, and its map [H,W].
+
+        Per layer: features scaled to unit length per pixel, squared differences weighted by the heads. The distance is
+        the sum over layers of the spatial means; the map is the sum of the layers' maps, enlarged bilinearly.
+        """
+        assert image.shape == truth.shape
+        return self._compared(image, self._features(truth))
+
+    @torch.no_grad()
+    def masked(self, image: Tensor, truth: Photograph) -> float:
+        """Mean of the map over the mask; what lies outside the mask is context, the same in both images."""
+        composed = torch.where(truth.mask[..., None], image, truth.color)
+        return float(self._compared(composed, truth.once(self._features))[1][truth.mask].mean())
+
+    @torch.no_grad()
+    def on_black(self, image: Tensor, truth: Photograph) -> float:
+        """The distance as published with both images black outside the mask; the black part is averaged in."""
+        return self._compared(image * truth.mask[..., None], truth.once(self._features_on_black))[0]
+
+    def _features(self, image: Tensor, _: Tensor | None = None) -> list[Tensor]:
         """Of an image [H,W,3] sRGB in [0,1], [1,C,h,w] per layer."""
         assert image.ndim == 3 and image.shape[2] == 3
         found: list[Tensor] = self.stack(image.to(torch.float32).permute(2, 0, 1)[None])
         return found
 
-    @torch.no_grad()
-    def __call__(self, image: Tensor, truth: Tensor, known: Sequence[Tensor] | None = None) -> tuple[float, Tensor]:
-        """Two images [H,W,3] sRGB in [0,1] -> the distance as published, and its map [H,W].
+    def _features_on_black(self, image: Tensor, mask: Tensor) -> list[Tensor]:
+        return self._features(image * mask[..., None])
 
-        known: the truth's `features`, if they are at hand. Per layer: features scaled to unit length per pixel, squared
-        differences weighted by the heads. The distance is the sum over layers of the spatial means; the map is the sum
-        of the layers' maps, enlarged bilinearly.
-        """
-        assert image.shape == truth.shape
+    def _compared(self, image: Tensor, truths: Sequence[Tensor]) -> tuple[float, Tensor]:
+        """Distance and map of an image from the truth whose features are given."""
         size = image.shape[:2]
         total, whole = 0.0, torch.zeros(size, device=image.device)
-        known = self.features(truth) if known is None else known
-        for ours, theirs, head in zip(self.features(image), known, self.heads, strict=True):
+        for ours, theirs, head in zip(self._features(image), truths, self.heads, strict=True):
             layer = _unlike(ours, theirs, head)
             total += float(layer.mean())
             whole += F.interpolate(layer, size, mode="bilinear", align_corners=False)[0, 0]
         return total, whole
-
-    def masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
-        """As `Against.masked`."""
-        return Against(self, truth, mask).masked(image)
-
-    def on_black(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
-        """As `Against.on_black`."""
-        return Against(self, truth, mask).on_black(image)
-
-
-class Against:
-    """One truth [H,W,3] sRGB in [0,1] with a mask [H,W] bool, which several images are compared with.
-
-    Its own features are found once.
-    """
-
-    def __init__(self, lpips: Lpips, truth: Tensor, mask: Tensor) -> None:
-        self.lpips, self.truth, self.mask = lpips, truth, mask
-
-    def masked(self, image: Tensor) -> float:
-        """Mean of the map over the mask; what lies outside the mask is context, the same in both images."""
-        composed = torch.where(self.mask[..., None], image, self.truth)
-        return float(self.lpips(composed, self.truth, self._features)[1][self.mask].mean())
-
-    def on_black(self, image: Tensor) -> float:
-        """The distance as published with both images black outside the mask; the black part is averaged in."""
-        inside = self.mask[..., None]
-        return self.lpips(image * inside, self.truth * inside, self._features_on_black)[0]
-
-    @cached_property
-    def _features(self) -> list[Tensor]:
-        return self.lpips.features(self.truth)
-
-    @cached_property
-    def _features_on_black(self) -> list[Tensor]:
-        return self.lpips.features(self.truth * self.mask[..., None])
 
 
 def _unlike(features: Tensor, truths: Tensor, head: Tensor) -> Tensor:

@@ -14,8 +14,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advtex_engine.metrics.image_metrics import eroded, gradient_magnitude, luminance
+from advtex_engine.metrics.photograph import Photograph
 from advtex_engine.refine.exposure import BRIGHT, DARK
-from advtex_engine.render.filtering import blurred, separable, window_sums
+from advtex_engine.render.filtering import blurred, window_sums
 
 BANDS = 3
 BAND_SIGMA = 1.2
@@ -34,6 +35,8 @@ S3_LEAST_CONTRAST, S3_LEAST_MEAN = 5.0, 2.0
 """Gray levels; blocks below have no sharpness (paper section III-A)."""
 S3_SHARE = 0.95
 """Share of a block that must lie in the mask."""
+S3_ROWS = 8
+"""Rows of blocks whose spectra are held at once: those of all take twice as long, most of it for new memory."""
 
 FLAT_SIGMA = 1.5
 """Standard deviation in pixels of the low-pass that separates fine texture, noise and ringing from shading."""
@@ -46,44 +49,49 @@ FLAT_PIXELS = 500
 """Flat pixels that a view must show for anything to be said of them."""
 
 
-def band_error(image: Tensor, truth: Tensor, mask: Tensor) -> float:
+def band_error(image: Tensor, truth: Photograph) -> float:
     """Mean |ln| of the ratio of amplitudes in three bands of a Laplacian pyramid, tile by tile; 0 is best.
 
     Tiles of 32, 16 and 8 pixels of the bands at full, half and quarter size count when they lie in the mask to 80 %.
     Insensitive to small shifts; blur, noise and wrong texture show. NaN when no tile lies in the mask.
     """
-    assert image.shape == truth.shape == (*mask.shape, 3)
-    planes = torch.stack((luminance(image), luminance(truth), mask.to(torch.float32)))
-    errors = []
-    for band in range(BANDS):
-        weight = planes[2]
-        energy = (planes[:2] - blurred(planes[:2], BAND_SIGMA)).square() * weight
-        tile = max(LEAST_TILE, TILE >> band)
-        if min(weight.shape) < tile:
-            break
-        ours, theirs, share = F.avg_pool2d(torch.cat((energy, weight[None]))[:, None], tile)[:, 0]
-        inside = share > TILE_SHARE
-        if bool(inside.any()):
-            ours, theirs = (part[inside] / share[inside] + BAND_FLOOR for part in (ours, theirs))
-            errors.append(float((ours / theirs).log().abs().mean()) / 2)
-        planes = _halved(planes)
+    assert image.shape == truth.color.shape
+    pairs = zip(_band_energies(image, truth.mask), truth.once(_band_energies), strict=True)
+    errors = [float((ours / theirs).log().abs().mean()) / 2 for ours, theirs in pairs]
     return sum(errors) / len(errors) if errors else math.nan
 
 
-def s3_ratio(image: Tensor, truth: Tensor, mask: Tensor) -> float:
+def _band_energies(image: Tensor, mask: Tensor) -> list[Tensor]:
+    """Per band the energies [N] of the tiles that count; bands without any are left out."""
+    plane, weight = luminance(image), mask.to(torch.float32)
+    energies = []
+    for band in range(BANDS):
+        tile = max(LEAST_TILE, TILE >> band)
+        if min(weight.shape) < tile:
+            break
+        energy = (plane - _low_pass(plane, BAND_SIGMA)).square() * weight
+        total, share = F.avg_pool2d(torch.stack((energy, weight))[:, None], tile)[:, 0]
+        inside = share > TILE_SHARE
+        if bool(inside.any()):
+            energies.append(total[inside] / share[inside] + BAND_FLOOR)
+        plane, weight = _halved(plane), _halved(weight)
+    return energies
+
+
+def s3_ratio(image: Tensor, truth: Photograph) -> float:
     """Mean S3 sharpness of the image over that of the truth, in blocks that lie in the mask to 95 %; NaN without any.
 
     S3 is that of `s3_map`. 1 is best, below is blurred.
     """
-    assert image.shape == truth.shape == (*mask.shape, 3)
+    assert image.shape == truth.color.shape
+    return (_s3(image, truth.mask) + 1e-6) / (truth.once(_s3) + 1e-6)
+
+
+def _s3(image: Tensor, mask: Tensor) -> float:
     if min(mask.shape) < S3_BLOCK:
         return math.nan
     share = F.avg_pool2d(mask.to(torch.float32)[None, None], S3_BLOCK, S3_STEP)[0, 0]
-    inside = share > S3_SHARE
-    if not bool(inside.any()):
-        return math.nan
-    ours, theirs = (float(s3_map(picture)[inside].mean()) for picture in (image, truth))
-    return (ours + 1e-6) / (theirs + 1e-6)
+    return float(s3_map(image)[share > S3_SHARE].mean())
 
 
 def s3_map(image: Tensor) -> Tensor:
@@ -105,7 +113,8 @@ def s3_map(image: Tensor) -> Tensor:
     start = S3_BLOCK // 2 - window // 2
     largest = F.max_pool2d(variation[None, None, start:, start:], window, S3_STEP)[0, 0, :rows, :columns]
     spatial = (largest / (4 * 255)).clamp(0, 1)
-    return (_spectral_sharpness(blocks) * spatial).sqrt()
+    spectral = torch.cat([_spectral_sharpness(part) for part in blocks.split(S3_ROWS)])  # type: ignore[no-untyped-call]
+    return (spectral * spatial).sqrt()
 
 
 def _spectral_sharpness(blocks: Tensor) -> Tensor:
@@ -129,20 +138,25 @@ def _spectral_sharpness(blocks: Tensor) -> Tensor:
     return sharpness * visible
 
 
-def flat_energy(image: Tensor, truth: Tensor, mask: Tensor) -> float:
+def flat_energy(image: Tensor, truth: Photograph, covered: Tensor) -> float:
     """Fine texture of the image over that of the truth where the truth is flat: above 1 ringing, speckles or seams.
 
     The ratio of root mean squares of luminance minus its low-pass (`FLAT_SIGMA`) over `flat_pixels`. The photograph's
-    sensor noise is part of the reference: a render without any grain scores below 1. mask: pixels that the render
-    covers; its holes would be counted as texture. NaN below FLAT_PIXELS.
+    sensor noise is part of the reference: a render without any grain scores below 1. covered: pixels of the mask that
+    the render covers; its holes would be counted as texture. NaN below FLAT_PIXELS.
     """
-    assert image.shape == truth.shape == (*mask.shape, 3)
-    flat = flat_pixels(truth, mask)
+    assert image.shape == truth.color.shape == (*covered.shape, 3)
+    flat = truth.once(flat_pixels) & eroded(covered, FLAT_WINDOW // 2)
     if int(flat.sum()) < FLAT_PIXELS:
         return math.nan
-    planes = torch.stack((luminance(image), luminance(truth)))
-    ours, theirs = (planes - blurred(planes, FLAT_SIGMA))[:, flat].double().square().mean(1).sqrt().tolist()
-    return float((ours + 1e-6) / (theirs + 1e-6))
+    details = (_detail(image, truth.mask), truth.once(_detail))
+    ours, theirs = (float(detail[flat].double().square().mean().sqrt()) for detail in details)
+    return (ours + 1e-6) / (theirs + 1e-6)
+
+
+def _detail(image: Tensor, _: Tensor) -> Tensor:
+    plane = luminance(image)
+    return plane - _low_pass(plane, FLAT_SIGMA)
 
 
 def flat_pixels(truth: Tensor, mask: Tensor) -> Tensor:
@@ -151,15 +165,22 @@ def flat_pixels(truth: Tensor, mask: Tensor) -> Tensor:
     The window must lie in the mask, and the root mean square of the smoothed luminance's gradient in it must be below
     FLAT_GRADIENT. Clipped pixels do not count: they have no noise to compare with.
     """
-    smooth = blurred(truth.to(torch.float32).permute(2, 0, 1), FLAT_SIGMA)
+    smooth = torch.stack([_low_pass(plane, FLAT_SIGMA) for plane in truth.to(torch.float32).permute(2, 0, 1)])
     clear = ((smooth > DARK) & (smooth < BRIGHT)).all(0)
-    gradient = gradient_magnitude(blurred(luminance(truth)[None], FLAT_SIGMA)[0])
+    gradient = gradient_magnitude(_low_pass(luminance(truth), FLAT_SIGMA))
     radius = FLAT_WINDOW // 2
     square = window_sums(gradient.double().square()[None], radius)[0] / FLAT_WINDOW**2
     return eroded(mask, radius) & (square < FLAT_GRADIENT**2) & clear
 
 
-def _halved(planes: Tensor) -> Tensor:
-    """The next level of the Gaussian pyramid (Burt & Adelson 1983): [N,H,W] -> [N,(H+1)//2,(W+1)//2]."""
-    kernel = planes.new_tensor([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
-    return separable(planes, kernel)[:, ::2, ::2]
+def _low_pass(plane: Tensor, sigma: float) -> Tensor:
+    """`blurred`, [H,W]: one plane after the other, since several at once take a CPU longer."""
+    return blurred(plane[None], sigma)[0]
+
+
+def _halved(plane: Tensor) -> Tensor:
+    """The next level of the Gaussian pyramid (Burt & Adelson 1983): [H,W] -> [(H+1)//2,(W+1)//2]."""
+    kernel = plane.new_tensor([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
+    padded = F.pad(plane[None, None], (2,) * 4, mode="reflect")
+    rows = F.conv2d(padded, kernel.expand(1, 1, 1, -1), stride=(1, 2))
+    return F.conv2d(rows, kernel[:, None].expand(1, 1, -1, 1), stride=(2, 1))[0, 0]

@@ -17,6 +17,7 @@ from torch import Tensor
 from advtex_engine.core.monitor import Glimpse, Monitor
 from advtex_engine.core.scene import Atlas, Camera, Scene, View, evenly_spread
 from advtex_engine.metrics.image_metrics import gradient_ratio, psnr
+from advtex_engine.metrics.photograph import Photograph
 from advtex_engine.previews.curves import curves
 from advtex_engine.render.pictures import encode_jpeg, to_bytes
 from advtex_engine.render.rasterize import rasterize
@@ -73,9 +74,9 @@ class Live:
         began = time.monotonic()
         pictures = [seen.picture(values) for seen in self._seen]
         scores = [
-            (psnr(picture, seen.photo, seen.mask), gradient_ratio(picture, seen.photo, seen.mask))
+            (psnr(picture, seen.photo), gradient_ratio(picture, seen.photo))
             for seen, picture in zip(self._seen, pictures, strict=True)
-            if bool(seen.mask.any())
+            if bool(seen.photo.mask.any())
         ]
         if scores:
             means = [sum(column) / len(column) for column in zip(*scores, strict=True)]
@@ -106,7 +107,7 @@ class _Footprint:
 class _Seen:
     """A view that is shown, at every k-th of its pixels.
 
-    hit: [h,w] bool, where it shows the mesh. mask: [h,w] bool, where the photograph shows it too. photo: [h,w,3].
+    hit: [h,w] bool, where it shows the mesh. photo: with a mask of where it shows it too.
     """
 
     def __init__(self, atlas: Atlas, view: View, kind: str) -> None:
@@ -115,17 +116,18 @@ class _Seen:
         first = stride // 2
         pixels = (slice(first, None, stride), slice(first, None, stride))
         self.name = view.name
-        self.photo = view.color[pixels].to(device, torch.float32) / 255
-        height, width, _ = self.photo.shape
+        color = view.color[pixels].to(device, torch.float32) / 255
+        height, width, _ = color.shape
         fragments = rasterize(atlas.mesh, _every_pixel(view.camera, stride, width, height))
         self.hit = fragments.face_index >= 0
-        self.mask = self.hit
+        mask = self.hit
         if view.depth is not None:
             measured = view.depth[pixels].to(device)
             near = (measured - fragments.depth).abs() < DEPTH_TOLERANCE[kind]
-            self.mask = self.mask & ((measured == 0) | near)
+            mask = mask & ((measured == 0) | near)
         if view.mask is not None:
-            self.mask = self.mask & view.mask[pixels].to(device)
+            mask = mask & view.mask[pixels].to(device)
+        self.photo = Photograph(color, mask)
         assert atlas.mesh.v_uv is not None and atlas.mesh.t_uv_idx is not None
         corners = atlas.mesh.v_uv[atlas.mesh.t_uv_idx[fragments.face_index[self.hit].long()]]
         self._uv = (fragments.barycentric[self.hit][:, :, None] * corners).sum(1)
@@ -145,7 +147,7 @@ class _Seen:
         """[h,w,3] float sRGB in [0,1]."""
         assert self._footprint is not None
         found = self._footprint
-        picture = torch.full_like(self.photo, BACKGROUND)
+        picture = torch.full_like(self.photo.color, BACKGROUND)
         with torch.no_grad():
             picture[self.hit] = (sample_texels(values.detach(), found.slots, found.weights) + found.rest).clamp(0, 1)
         return picture

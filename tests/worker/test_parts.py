@@ -32,7 +32,7 @@ from advtex_options.methods import known_methods
 from advtex_store.errors import StaleAttempt
 from advtex_store.queue import TASK
 from advtex_store.records import Lease
-from advtex_worker import lease
+from advtex_worker import lease, memory
 from advtex_worker.adapt import texture_config
 from advtex_worker.events import (
     CheckpointEvent,
@@ -47,7 +47,7 @@ from advtex_worker.events import (
 )
 from advtex_worker.lease import Ending, LeaseKeeper
 from advtex_worker.locks import try_lock
-from advtex_worker.memory import usable_memory
+from advtex_worker.memory import usable_cores, usable_memory
 from advtex_worker.progress import ProgressTracker
 
 
@@ -286,6 +286,33 @@ def test_memory_is_the_smallest_gpus_or_the_machines(tmp_path: Path, monkeypatch
     assert 0 < machine <= psutil.virtual_memory().total
     tool.write_text("#!/bin/sh\nexit 9\n")
     assert usable_memory("auto") == machine
+
+
+@pytest.mark.parametrize(
+    ("share", "quota", "cores"),
+    [
+        ("max 100000", None, 64),
+        ("400000 100000", None, 4),
+        ("160000 100000", None, 2),
+        ("20000 100000", None, 1),
+        ("9900000 100000", None, 64),
+        (None, "-1", 64),
+        (None, "300000", 3),
+        (None, None, 64),
+        ("nonsense", None, 64),
+    ],
+)
+def test_a_container_s_share_of_the_cores_is_kept_to(
+    share: str | None, quota: str | None, cores: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ("cpu.max", "quota", "period")
+    for name, text in zip(names, (share, quota, "100000"), strict=True):
+        if text is not None:
+            (tmp_path / name).write_text(f"{text}\n")
+    monkeypatch.setattr(memory, "CPU_SHARE", tmp_path / "cpu.max")
+    monkeypatch.setattr(memory, "CPU_SHARE_V1", (tmp_path / "quota", tmp_path / "period"))
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(64)))
+    assert usable_cores() == cores
 
 
 def test_a_stale_attempt_is_told_once_and_overrules_a_cancel() -> None:

@@ -17,7 +17,7 @@ from advtex_contract.options import JobOptions
 from advtex_store.memory_estimate import GIB
 from advtex_worker.adapt import texture_config
 from advtex_worker.locks import first_lock, lock_paths
-from advtex_worker.memory import Gpu, list_gpus
+from advtex_worker.memory import Gpu, list_gpus, usable_cores
 from advtex_worker.settings import WorkerSettings
 from advtex_worker.slots import Slot, find_slots, hold, settings_of
 
@@ -84,7 +84,7 @@ def test_slots_share_threads_and_memory() -> None:
     slot = Slot("GPU-aaaa", 12 * GIB)
     own = settings_of(slot, settings(jobs_per_gpu=2), 4)
     assert (own.gpu, own.memory_bytes) == ("GPU-aaaa", 12 * GIB)
-    assert own.threads == max(1, len(os.sched_getaffinity(0)) // 4)
+    assert own.threads == max(1, usable_cores() // 4)
     assert settings_of(slot, settings(jobs_per_gpu=2, threads=3), 4).threads == 3
     assert settings_of(slot, settings(), 1).memory_bytes is None, "alone on a GPU it may take what is free"
 

@@ -1,4 +1,4 @@
-"""Which GPUs this worker may use, and how much memory jobs may use on it, found without torch."""
+"""Which GPUs and how many cores this worker may use, and how much memory jobs may use on it, found without torch."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 CGROUP_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
+CPU_SHARE = Path("/sys/fs/cgroup/cpu.max")
+CPU_SHARE_V1 = (Path("/sys/fs/cgroup/cpu/cpu.cfs_quota_us"), Path("/sys/fs/cgroup/cpu/cpu.cfs_period_us"))
 QUERY = ["nvidia-smi", "--query-gpu=uuid,memory.total", "--format=csv,noheader,nounits"]
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 
@@ -47,6 +49,22 @@ def usable_memory(device: str) -> int:
     """Bytes: of the smallest GPU, since a job may run on any of them, or of the machine (or container) without one."""
     gpus = [] if device == "cpu" else list_gpus()
     return min(gpu.memory_bytes for gpu in gpus) if gpus else _machine_memory()
+
+
+def usable_cores() -> int:
+    """Cores of this process, or fewer where its container may use a share of their time only.
+
+    With a thread on each of 64 cores a container of four would stand still for most of every tenth of a second.
+    """
+    cores = len(os.sched_getaffinity(0))
+    for files in ((CPU_SHARE,), CPU_SHARE_V1):
+        try:
+            quota, period = map(int, " ".join(file.read_text() for file in files).split())
+        except (OSError, ValueError):  # there is no such limit, or it is "max"
+            continue
+        if quota > 0:  # -1 is none
+            cores = min(cores, max(1, round(quota / period)))
+    return cores
 
 
 def _machine_memory() -> int:

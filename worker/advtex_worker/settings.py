@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from pydantic import Field
 
 from advtex_store.settings import StoreSettings
+from advtex_worker.memory import usable_cores
 
 CACHE_BYTES = 20 << 30
 
@@ -30,9 +30,7 @@ class WorkerSettings(StoreSettings):
     cache_bytes: int | None = Field(
         default=None, ge=0, description="of scans that are kept; by default 20 GiB, and none where blobs are a folder"
     )
-    threads: int = Field(
-        default_factory=lambda: len(os.sched_getaffinity(0)), ge=1, description="of the engine, at most"
-    )
+    threads: int = Field(default_factory=usable_cores, ge=1, description="of the engine, at most")
     grace_seconds: float = Field(default=30.0, gt=0, description="a runner that was asked to stop is killed after this")
     refused_seconds: float = Field(
         default=600.0, ge=0, description="a job ends after the storage has refused it for so long: no right, no bucket"

@@ -145,7 +145,7 @@ BUILT_IN = (
     ),
     Method(
         "view_selection_no_descent",
-        "the same without the latter: few seams, leveled; in about a minute",
+        "the same without the latter: what it is worth; in about a minute",
         "advtex_engine.methods.view_selection:view_selection_no_descent",
     ),
 )

@@ -5,7 +5,7 @@
 On synthetic scans with known truth, `default` with the errors that real ones have (`advtex_engine.synthetic.scan`) and
 `geometry` with larger ones of the mesh alone, and on scans of one's own against every 8th frame, held out. Writes
 parts.json (one cell per scan and variant), parts.md, and per synthetic scan a picture: a photograph from a held-out
-place beside the mean, view selection and the whole; per real scan and variant the model and a contact sheet. Stopped
+place beside the mean, selection alone and the whole; per real scan and variant the model and a contact sheet. Stopped
 and run again, it goes on with the missing cells.
 """
 
@@ -112,7 +112,7 @@ VARIANTS = {
     "without alignment in the loop": Variant(changes={"alignment": False}),
     "without feature matching": Variant(changes={"feature_weight": 0.0}),
 }
-SHOWN = ("mean", "view selection", "the whole")
+SHOWN = ("mean", "no descent", "the whole")
 HOLDOUT = 8  # of scans of one's own
 
 

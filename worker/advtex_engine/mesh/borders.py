@@ -159,13 +159,13 @@ def _unit(vectors: Floats) -> Floats:
 
 def border(position: npt.NDArray[np.floating], faces: Integers) -> tuple[Integers, Floats]:
     """Directed edges [B,2] that only one face has, and that face's normal (of twice its area's length) [B,3]."""
-    corners = position.astype(np.float64)[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    low, high = edges.min(axis=1), edges.max(axis=1)
-    _, inverse, count = np.unique(low * len(position) + high, return_inverse=True, return_counts=True)
-    single = np.flatnonzero(count[inverse] == 1)
-    return edges[single], normals[single // 3]
+    key = np.minimum(*edges.T) * len(position) + np.maximum(*edges.T)
+    inorder, order = (part.numpy() for part in torch.sort(torch.from_numpy(key)))  # NumPy's takes three times as long
+    differs = np.diff(inorder, prepend=-1, append=-1) != 0
+    single = np.sort(order[differs[:-1] & differs[1:]])
+    a, b, c = position.astype(np.float64)[faces[single // 3]].swapaxes(0, 1)
+    return edges[single], np.cross(b - a, c - a)
 
 
 def only_successor(edges: Integers, vertices: int) -> Integers:

@@ -6,7 +6,7 @@ ingest -> conventions -> fusion (of scans without a mesh) -> geometry -> refinem
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import torch
 
 from advtex_engine.atlas import ChartMaker, MeshPreparation, begin_charts, charts_folder
 from advtex_engine.budget import Budget
-from advtex_engine.conventions import checked_conventions
+from advtex_engine.conventions import checked_conventions, coarse_mesh
 from advtex_engine.core import Diverged, Monitor, TextureConfig, WarningKeeper
 from advtex_engine.core.scene import DepthFrame, Mesh
 from advtex_engine.ingest import Capture, FrameStore, read_capture
@@ -52,6 +52,7 @@ from advtex_engine.stages import (
 )
 from advtex_options.box import parse_box
 from advtex_options.outputs import wanted
+from advtex_scan.manifest import MeshRefinement, UpAxis
 
 
 @dataclass(frozen=True)
@@ -165,19 +166,25 @@ def _scene(
     monitor = stages.monitor
     made: dict[str, Any] = {"conventions": None, "fusion": None, "registration": None}
     box = None if config.box is None else parse_box(config.box)
-    with MeshPreparation(config.face_budget, charts, box=box, holes=config.close_holes) as preparation:
+    with (
+        MeshPreparation(config.face_budget, charts, box=box, holes=config.close_holes) as preparation,
+        ThreadPoolExecutor(1, thread_name_prefix="advtex-coarse") as beside,
+    ):
+        coarse: Future[Mesh] | None = None
+
+        def begin(mesh: Mesh, moves: MeshRefinement, up_axis: UpAxis) -> None:
+            nonlocal coarse
+            preparation.begin(mesh, up_axis=up_axis, moves=moves != "none")
+            if moves == "none":
+                coarse = beside.submit(coarse_mesh, mesh)
+
         with stages.run("ingest"):
-            capture = read_capture(
-                scan,
-                config,
-                store,
-                monitor,
-                lambda mesh, moves, up: preparation.begin(mesh, up_axis=up, moves=moves != "none"),
-            )
+            capture = read_capture(scan, config, store, monitor, begin)
             if capture.mesh is not None:
                 preparation.look(_looks(capture, capture.mesh, config))
         with stages.run("conventions"):
-            made["conventions"] = checked_conventions(scan, capture.manifest, capture.mesh, monitor)
+            looked_at = capture.mesh if coarse is None else coarse.result()
+            made["conventions"] = checked_conventions(scan, capture.manifest, looked_at, monitor)
         if capture.mesh is None:
             with stages.run("fusion"):
                 fused, made["fusion"] = fuse(capture.measured(), device, monitor)
@@ -192,10 +199,10 @@ def _scene(
                 return mesh
 
             mesh, made["mesh"] = preparation.result(monitor, onto_depth if frames else None)
-            made["normal_map"] = keep_detail(preparation, stages.folder)
             capture, made["view_choice"] = capture.choose(mesh, config.max_views, monitor)
             scene = capture.scene(mesh, monitor)
             begin_charts(scene.mesh, charts)
+            made["normal_map"] = keep_detail(preparation, stages.folder)
     return scene, made
 
 

@@ -197,6 +197,7 @@ def test_packing_in_a_child_is_packing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_child_starts_without_torch() -> None:
     """It takes seconds and hundreds of MB to import, and a mesh may have dozens of children."""
-    told = "import sys, advtex_engine.runtime.children, advtex_engine.atlas.charting; print('torch' in sys.modules)"
+    modules = "advtex_engine.runtime.children, advtex_engine.atlas.charting, advtex_engine.mesh.quadric"
+    told = f"import sys, {modules}; print('torch' in sys.modules)"
     ran = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, check=True)
     assert ran.stdout == "False\n"

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from advtex_engine.core.errors import Problem, ScanError
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Mesh
-from advtex_engine.mesh.clean import clean, decimate
-from advtex_engine.mesh.quadric import collapse_edges
+from advtex_engine.mesh import quadric
+from advtex_engine.mesh.clean import ROUNDS, clean, collapse_edges, decimate
 
 
 class Listener(Monitor):
@@ -162,14 +162,24 @@ def test_decimation_says_that_uv_are_dropped() -> None:
 def test_threads_that_collapse_at_the_same_time_do_not_mix_up_their_meshes() -> None:
     """A scan's mesh is decimated while another of it is made coarse to judge its conventions."""
     meshes = [sphere(3), sphere(4)] * 100
-    alone = [collapse_edges(mesh, 200) for mesh in meshes[:2]]
+    alone = [collapse_edges(mesh, 200, Monitor()) for mesh in meshes[:2]]
     interval = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
     try:
         with ThreadPoolExecutor(4) as pool:
-            together = list(pool.map(lambda mesh: collapse_edges(mesh, 200), meshes))
+            together = list(pool.map(lambda mesh: collapse_edges(mesh, 200, Monitor()), meshes))
     finally:
         sys.setswitchinterval(interval)
     for number, collapsed in enumerate(together):
         assert torch.equal(collapsed.v_pos, alone[number % 2].v_pos)
         assert torch.equal(collapsed.t_pos_idx, alone[number % 2].t_pos_idx)
+
+
+def test_a_child_collapses_as_the_process_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = sphere(4)
+    here = collapse_edges(mesh, 300, Monitor(), ROUNDS)
+    monkeypatch.setattr(quadric, "CHILD_FACES", 1)
+    apart = collapse_edges(mesh, 300, Monitor(), ROUNDS)
+    assert len(apart.t_pos_idx) <= 300
+    assert torch.equal(here.v_pos, apart.v_pos)
+    assert torch.equal(here.t_pos_idx, apart.t_pos_idx)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import subprocess
 import sys
 import threading
@@ -40,17 +41,20 @@ class Machine:
     """A /proc/stat and clocks that go on as they are told."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, stat: Path) -> None:
-        self._stat, self._at, self._own, self._ticks = stat, 0.0, 0.0, 1000
+        self._stat, self._at, self._own, self._children, self._ticks = stat, 0.0, 0.0, 0.0, 1000
         monkeypatch.setattr(threads, "STAT", stat)
         monkeypatch.setattr(time, "monotonic", lambda: self._at)
         monkeypatch.setattr(time, "process_time", lambda: self._own)
+        used = resource.struct_rusage
+        monkeypatch.setattr(resource, "getrusage", lambda _: used((self._children, *[0] * (used.n_fields - 1))))
         self.go_on(0, own=0, others=0)
 
-    def go_on(self, seconds: float, *, own: float, others: float) -> None:
-        """For so long, this process and the others use so many cores."""
+    def go_on(self, seconds: float, *, own: float, others: float, children: float = 0) -> None:
+        """For so long, this process, the others, and children that end then use so many cores."""
         self._at += seconds
         self._own += seconds * own
-        self._ticks += round(seconds * (own + others) * os.sysconf("SC_CLK_TCK"))
+        self._children += seconds * children
+        self._ticks += round(seconds * (own + others + children) * os.sysconf("SC_CLK_TCK"))
         core = min(os.sched_getaffinity(0))
         self._stat.write_text(
             f"cpu  1 1 1 1\ncpu{core} {self._ticks} 0 0 {self._at} 0 0 0 0 0 0\ncpu9999 {self._at} 0 0 0 0 0 0 0 0 0\n"
@@ -103,6 +107,11 @@ def test_what_others_use_is_left_to_them_until_they_stop(
             fit_threads()
             assert torch.get_num_threads() == left
             assert thread_limit() == limit
+        machine.go_on(10, own=1, others=0, children=limit - 1)
+        fit_threads()
+        assert torch.get_num_threads() == limit, "what ended children used is free again"
+        machine.go_on(10, own=0, others=2 * limit)
+        fit_threads()
         machine.go_on(0.5, own=1, others=0)  # too short to tell
         fit_threads()
         assert torch.get_num_threads() == 1

@@ -36,8 +36,7 @@ class _Prepared:
     mesh: Mesh
     trimmed: Trimmed
     problems: list[Problem]
-    detail: Detail | None
-    normal_map: dict[str, Any]
+    detail: Future[tuple[Detail | None, dict[str, Any]]]  # found while the mesh is used already
 
 
 class MeshPreparation:
@@ -98,8 +97,7 @@ class MeshPreparation:
     def detail(self) -> tuple[Detail | None, dict[str, Any]]:
         """What decimation took of the mesh that `result` gives, and the report about it, as `find_detail` has them."""
         assert self._prepared is not None
-        prepared = self._prepared.result()
-        return prepared.detail, prepared.normal_map
+        return self._prepared.result().detail.result()
 
     def _reduce(self, mesh: Mesh) -> tuple[Mesh, list[Problem]]:
         said = _Said()
@@ -124,8 +122,8 @@ class MeshPreparation:
             len(cleaned.t_pos_idx) - len(cropped.t_pos_idx),
             len(closed.t_pos_idx) - len(prepared.t_pos_idx),
         )
-        detail, normal_map = find_detail(kept, prepared)
-        return _Prepared(closed, Trimmed(outside, floaters, lost, holes, added), said.problems, detail, normal_map)
+        detail = self._pool.submit(find_detail, kept, prepared)
+        return _Prepared(closed, Trimmed(outside, floaters, lost, holes, added), said.problems, detail)
 
 
 def _floaters_dropped(floaters: int, faces: int) -> Problem:

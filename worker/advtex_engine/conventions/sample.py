@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from advtex_engine.conventions.readings import Reading
+from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Mesh
 from advtex_engine.ingest.decode import (
     Color,
@@ -31,7 +32,7 @@ from advtex_engine.ingest.decode import (
 from advtex_engine.ingest.depth import DepthEncoding, Raw, declared_encoding, outside_mask
 from advtex_engine.ingest.frame_cameras import depth_camera, frame_camera, inverse_pose
 from advtex_engine.ingest.video import VideoReader
-from advtex_engine.mesh.quadric import collapse_edges
+from advtex_engine.mesh.clean import collapse_edges
 from advtex_scan.archive import ScanArchive
 from advtex_scan.manifest import FrameEntry, Intrinsics, ScanManifest, VideoFrame
 
@@ -72,6 +73,13 @@ class Sample:
         return torch.from_numpy(np.stack([encoding.metres(raw) for raw in self.raw]))
 
 
+def coarse_mesh(mesh: Mesh) -> Mesh:
+    """The mesh with at most about MESH_FACES faces; borders and degenerate faces do not matter here."""
+    if len(mesh.t_pos_idx) <= MESH_FACES:
+        return Mesh(mesh.v_pos, mesh.t_pos_idx)
+    return collapse_edges(mesh, MESH_FACES, Monitor())
+
+
 def take_sample(archive: ScanArchive, manifest: ScanManifest, mesh: Mesh | None) -> Sample:
     """Neighboring frames from all over the scan. mesh: in world coordinates.
 
@@ -101,7 +109,7 @@ def take_sample(archive: ScanArchive, manifest: ScanManifest, mesh: Mesh | None)
         if raw is None
         else _intrinsics([rectified(camera) for camera in depth_cameras], size),
         depth_to_color=torch.tensor(manifest.depth_to_color, dtype=torch.float64),
-        mesh=None if mesh is None else _coarse(mesh),
+        mesh=None if mesh is None else coarse_mesh(mesh),
     )
     first_depth = None if raw is None else depth_cameras[0]
     sample = Sample(raw, encoding, reading, frames[0].color_intrinsics, first_depth)
@@ -189,13 +197,6 @@ def _unmasked(raw: Raw, entry: FrameEntry, mask: Mask | None, size: tuple[int, i
 def _depth_intrinsics(entry: FrameEntry) -> Intrinsics:
     assert entry.depth_intrinsics is not None
     return entry.depth_intrinsics
-
-
-def _coarse(mesh: Mesh) -> Mesh:
-    """The mesh with at most about MESH_FACES faces; borders and degenerate faces do not matter here."""
-    if len(mesh.t_pos_idx) <= MESH_FACES:
-        return Mesh(mesh.v_pos, mesh.t_pos_idx)
-    return collapse_edges(mesh, MESH_FACES)
 
 
 def _intrinsics(cameras: Sequence[Intrinsics], size: tuple[int, int]) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -80,7 +81,7 @@ def one_thread_each() -> AbstractContextManager[None]:
 
 @dataclass
 class _Load:
-    """What was measured last. limit: threads without any load. busy, own: seconds of all processes, of this one."""
+    """What was measured last. limit: threads without any load. busy, own: seconds of all processes, of this one's."""
 
     limit: int
     at: float
@@ -102,7 +103,7 @@ def threads_fitted() -> Iterator[None]:
     if busy is None:
         yield
         return
-    _load = _Load(limit, time.monotonic(), busy, time.process_time())
+    _load = _Load(limit, time.monotonic(), busy, _own_seconds())
     try:
         yield
     finally:
@@ -114,7 +115,7 @@ def fit_threads() -> None:
     """To be called between operations, however often: leaves cores that other processes use to these."""
     if _load is None or (passed := time.monotonic() - _load.at) < WINDOW_SECONDS or (busy := _busy_seconds()) is None:
         return
-    own = time.process_time()
+    own = _own_seconds()
     others = (busy - _load.busy - (own - _load.own)) / passed
     torch.set_num_threads(fitting_threads(_load.limit, len(_cores()), others))
     _load.at, _load.busy, _load.own = time.monotonic(), busy, own
@@ -128,6 +129,12 @@ def fitting_threads(limit: int, cores: int, others: float) -> int:
 def thread_limit() -> int:
     """Threads that PyTorch's operations take where other processes leave all cores."""
     return torch.get_num_threads() if _load is None else _load.limit
+
+
+def _own_seconds() -> float:
+    """Of this process and of its children that have ended: what these used is free again."""
+    ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + ended.ru_utime + ended.ru_stime
 
 
 def _busy_seconds() -> float | None:

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 from advtex_engine.atlas.build import begin_charts
 from advtex_engine.atlas.chart_cache import ChartMaker
-from advtex_engine.core.errors import Problem
+from advtex_engine.core.errors import Problem, Stopped
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import DepthFrame, Mesh
 from advtex_engine.mesh.clean import clean, decimate
 from advtex_engine.mesh.detail import Detail, find_detail
 from advtex_engine.mesh.holes import close_holes
 from advtex_engine.mesh.trim import crop, drop_floaters
+from advtex_engine.runtime.children import STOP_SECONDS
 from advtex_options.box import Box
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -55,11 +59,13 @@ class MeshPreparation:
         self._reduced: Future[tuple[Mesh, list[Problem]]] | None = None  # of a mesh that moves
         self._prepared: Future[_Prepared] | None = None
         self._frames = Future[Sequence[DepthFrame]]()
+        self._canceled = threading.Event()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        self._canceled.set()
         self.look(())
         self._pool.shutdown()
 
@@ -79,17 +85,17 @@ class MeshPreparation:
         """The mesh that was begun with, once it is ready, and what was trimmed of it, for the report.
 
         move: of a mesh that moves. Without `look` before it, the mesh is decimated by itself. Raises what it, `clean`
-        and `crop` do, and tells the monitor the rest.
+        and `crop` do, and Stopped when the monitor asks for it; tells the monitor the rest.
         """
         self.look(())
         if self._prepared is None:
             assert self._reduced is not None
-            reduced, said = self._reduced.result()
+            reduced, said = _awaited(self._reduced, monitor)
             for problem in said:
                 monitor.warning(problem)
             moved = reduced if move is None else move(reduced)
             self._prepared = self._pool.submit(self._prepare, moved, self._up_axis, True)
-        prepared = self._prepared.result()
+        prepared = _awaited(self._prepared, monitor)
         for problem in prepared.problems:
             monitor.warning(problem)
         return prepared.mesh, asdict(prepared.trimmed)
@@ -100,11 +106,11 @@ class MeshPreparation:
         return self._prepared.result().detail.result()
 
     def _reduce(self, mesh: Mesh) -> tuple[Mesh, list[Problem]]:
-        said = _Said()
+        said = _Said(self._canceled)
         return decimate(clean(mesh), self._face_budget, said), said.problems
 
     def _prepare(self, mesh: Mesh, up_axis: str, moves: bool) -> _Prepared:
-        said = _Said()
+        said = _Said(self._canceled)
         cleaned = clean(mesh)
         cropped = cleaned if self._box is None else crop(cleaned, self._box, up_axis)
         kept, floaters = drop_floaters(cropped)
@@ -144,11 +150,22 @@ def _uv_dropped(holes: int) -> Problem:
     )
 
 
-class _Said(Monitor):
-    """Keeps warnings: a run's own monitor is called on the run's thread only."""
+def _awaited(future: Future[T], monitor: Monitor) -> T:
+    while not wait([future], STOP_SECONDS).done:
+        if monitor.stop_requested():
+            raise Stopped("stopped while the mesh was made ready; resume begins it again")
+    return future.result()
 
-    def __init__(self) -> None:
+
+class _Said(Monitor):
+    """Keeps warnings: a run's own monitor is called on the run's thread only. Stops once all is canceled."""
+
+    def __init__(self, canceled: threading.Event) -> None:
         self.problems = list[Problem]()
+        self._canceled = canceled
+
+    def stop_requested(self) -> bool:
+        return self._canceled.is_set()
 
     def warning(self, problem: Problem) -> None:
         self.problems.append(problem)

@@ -18,7 +18,7 @@ from advtex_engine.core.scene import Mesh
 
 
 @pytest.mark.parametrize("moves", [False, True])
-def test_a_stop_ends_what_is_under_way(monkeypatch: pytest.MonkeyPatch, moves: bool) -> None:
+def test_the_end_of_a_run_ends_what_was_begun(monkeypatch: pytest.MonkeyPatch, moves: bool) -> None:
     begun, ended = threading.Event(), threading.Event()
 
     def endless(_mesh: Mesh, _budget: int, monitor: Monitor, *_: object) -> Mesh:
@@ -29,17 +29,17 @@ def test_a_stop_ends_what_is_under_way(monkeypatch: pytest.MonkeyPatch, moves: b
         ended.set()
         raise Stopped("canceled")
 
-    class Stopping(Monitor):
-        def stop_requested(self) -> bool:
-            assert threading.current_thread() is threading.main_thread()  # as the monitor is promised
-            return begun.is_set()
-
     monkeypatch.setattr(preparation, "decimate", endless)
     ball = trimesh.creation.icosphere(subdivisions=2)
     mesh = Mesh(torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(ball.faces))
-    with ChartMaker(None) as charts, MeshPreparation(100, charts) as prepared:
-        prepared.begin(mesh, moves=moves)
-        with pytest.raises(Stopped, match="resume begins it again"):
-            prepared.result(Stopping())
-        assert not ended.is_set()
+
+    def stopped_run() -> None:
+        with ChartMaker(None) as charts, MeshPreparation(100, charts) as prepared:
+            prepared.begin(mesh, moves=moves)
+            prepared.look(())
+            assert begun.wait(10)
+            raise Stopped("stopped after another stage")
+
+    with pytest.raises(Stopped, match="after another stage"):
+        stopped_run()
     assert ended.is_set()

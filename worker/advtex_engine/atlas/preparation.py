@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 from advtex_engine.atlas.build import begin_charts
 from advtex_engine.atlas.chart_cache import ChartMaker
-from advtex_engine.core.errors import Problem, Stopped
+from advtex_engine.core.errors import Problem
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import DepthFrame, Mesh
 from advtex_engine.mesh.clean import clean, decimate
 from advtex_engine.mesh.detail import Detail, find_detail
 from advtex_engine.mesh.holes import close_holes
 from advtex_engine.mesh.trim import crop, drop_floaters
-from advtex_engine.runtime.children import STOP_SECONDS
 from advtex_options.box import Box
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -85,17 +82,17 @@ class MeshPreparation:
         """The mesh that was begun with, once it is ready, and what was trimmed of it, for the report.
 
         move: of a mesh that moves. Without `look` before it, the mesh is decimated by itself. Raises what it, `clean`
-        and `crop` do, and Stopped when the monitor asks for it; tells the monitor the rest.
+        and `crop` do, and tells the monitor the rest.
         """
         self.look(())
         if self._prepared is None:
             assert self._reduced is not None
-            reduced, said = _awaited(self._reduced, monitor)
+            reduced, said = self._reduced.result()
             for problem in said:
                 monitor.warning(problem)
             moved = reduced if move is None else move(reduced)
             self._prepared = self._pool.submit(self._prepare, moved, self._up_axis, True)
-        prepared = _awaited(self._prepared, monitor)
+        prepared = self._prepared.result()
         for problem in prepared.problems:
             monitor.warning(problem)
         return prepared.mesh, asdict(prepared.trimmed)
@@ -150,15 +147,8 @@ def _uv_dropped(holes: int) -> Problem:
     )
 
 
-def _awaited(future: Future[T], monitor: Monitor) -> T:
-    while not wait([future], STOP_SECONDS).done:
-        if monitor.stop_requested():
-            raise Stopped("stopped while the mesh was made ready; resume begins it again")
-    return future.result()
-
-
 class _Said(Monitor):
-    """Keeps warnings: a run's own monitor is called on the run's thread only. Stops once all is canceled."""
+    """Keeps warnings: a run's own monitor is called on the run's thread only. Stops what nobody waits for any more."""
 
     def __init__(self, canceled: threading.Event) -> None:
         self.problems = list[Problem]()

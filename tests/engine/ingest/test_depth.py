@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from advtex_engine.core.errors import Problem
@@ -177,6 +177,21 @@ def test_depth_of_a_shifted_camera_lands_on_the_wall(width: int, height: int, fo
     # A reading falls somewhere in its pixel, or is repeated over several: a pixel's width of the wall's slope.
     slope = np.abs(np.gradient(expected, axis=1)).max() * max(1.0, focal / 60.0)
     assert np.abs(seen - expected)[valid].max() < 1.5 * slope + 1e-5
+
+
+@given(st.floats(0.4, 5.0), st.floats(0.4, 5.0))
+@example(1.2, 1.2)
+@example(2.2, 1.0)
+def test_a_finer_color_image_has_no_gaps_in_its_depth(wider: float, higher: float) -> None:
+    """However much finer it is: what the depth image shows has a depth in nearly every pixel."""
+    depth_camera = camera()
+    color_camera = camera(round(64 * wider), round(48 * higher))
+    K = color_camera.K.clone()
+    K[0, 0], K[1, 1] = 60.0 * wider, 60.0 * higher
+    seen = depth_in_color_image(torch.full((48, 64), 2.0), depth_camera, replace(color_camera, K=K))
+    assert set(seen.unique().tolist()) <= {0.0, 2.0}
+    inside = seen[2:-2, 2:-2]
+    assert float((inside > 0).float().mean()) > 0.97
 
 
 def test_the_nearest_of_two_readings_wins() -> None:

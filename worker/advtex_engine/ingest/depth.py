@@ -29,6 +29,7 @@ JUDGED_WIDTH = 160
 AGREEMENT = 0.05
 FITTING_SHARE = 0.5
 MIN_READINGS = 500
+FINER_BY_NOTHING = 0.01  # an image that is finer by a hundredth has gaps in two pixels of a hundred: as good as none
 CLEARLY = 0.8  # of the share that agrees from other poses may agree in another unit, for the poses to be what is wrong
 
 
@@ -186,8 +187,8 @@ def depth_in_color_image(depth: Tensor, depth_camera: Camera, color_camera: Came
     one, readings are repeated so that they leave no gaps. Not differentiable.
     """
     assert depth.shape == (depth_camera.height, depth_camera.width)
-    finer = float((color_camera.K[0, 0] / depth_camera.K[0, 0]).max())
-    repeat = max(1, round(finer + 0.25))
+    finer = max(float(color_camera.K[axis, axis] / depth_camera.K[axis, axis]) for axis in (0, 1))
+    repeat = max(1, math.ceil(finer - FINER_BY_NOTHING))
     if repeat > 1:
         depth = depth.repeat_interleave(repeat, 0).repeat_interleave(repeat, 1)
         depth_camera = scaled_camera(depth_camera, depth_camera.width * repeat, depth_camera.height * repeat)

@@ -7,6 +7,8 @@ from typing import Any
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from advtex_engine.core.cameras import project, unproject
 from advtex_engine.core.scene import Atlas, Camera, Mesh, View
@@ -16,7 +18,7 @@ from advtex_engine.render import pairs
 from advtex_engine.render.pairs import example_differences, overlaps, related_pairs
 from advtex_engine.render.reproject import reproject, unproject_pixels
 from advtex_engine.render.texture import decode_uv
-from advtex_engine.render.view_maps import ViewMaps, build_view_maps
+from advtex_engine.render.view_maps import UNMEASURED, ViewMaps, build_view_maps, shows_something_else
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 
@@ -94,9 +96,24 @@ def test_device_depth_that_contradicts_the_mesh_is_background() -> None:
     measured[:10] = 1.5
     measured[10:20] = 0
     depth = maps_of([camera_at(0.0)], measured).depth[0].view(HEIGHT, WIDTH)
-    assert (depth[:10] == 0).all()
-    assert (depth[10:20] > 0).all()
+    reach = round(WIDTH * UNMEASURED)
+    assert 0 < reach < 10
+    assert (depth[: 10 + reach] == 0).all(), "a reading speaks for pixels near it that have none"
+    assert (depth[10 + reach : 20, : WIDTH // 4] > 0).all()
     assert (depth[HEIGHT // 2, WIDTH // 2] == 0).all(), "the card is nearer than measured"
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.02, 0.5, 1.0]))
+def test_what_shows_something_else_is_what_its_plain_twin_says(seed: int, unmeasured: float) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    measured, rendered = (1 + torch.rand(23, 110, generator=generator) * scale for scale in (0.104, 0.1))
+    measured[torch.rand(measured.shape, generator=generator) < unmeasured] = 0
+    differs = (measured > 0) & ((measured - rendered).abs() >= 0.1)
+    expected = differs.clone()
+    for row, column in (measured == 0).nonzero().tolist():
+        window = differs[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
+        expected[row, column] = window.any()
+    assert torch.equal(shows_something_else(measured, rendered, 0.1), expected)
 
 
 def pixel_points(maps: ViewMaps, view: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from advtex_engine.core.scene import Atlas, View
+from advtex_engine.render.filtering import window_sums
 from advtex_engine.render.prefetch import uploaded
 from advtex_engine.render.rasterize import rasterize_views
 from advtex_engine.render.texture import encode_uv, number_slots, touched_slots
@@ -21,6 +22,10 @@ from advtex_engine.render.texture import encode_uv, number_slots, touched_slots
 DEPTH_TOLERANCE = {"object": 0.03, "scene": 0.1}  # theta_z, metres (paper section 3.3)
 BYTES_PER_PIXEL = 9
 TOGETHER = 32  # views of the host that are on the device at once
+
+UNMEASURED = 1 / 50
+"""Of an image's width: how far a reading speaks for pixels that have none. Depth cameras measure nothing beside what
+stands in front of something else, and depth that is seen from the color camera has gaps there."""
 
 Allocate = Callable[[tuple[int, ...], torch.dtype], Tensor]
 """Shape and type -> a tensor with any content, where views are to be kept."""
@@ -86,8 +91,7 @@ def build_view_maps(atlas: Atlas, views: tuple[View, ...], kind: str, allocate: 
 
     allocate: makes what color, uv and depth are kept in; by default on the mesh's device.
 
-    Device depth masks what the mesh lacks: a pixel whose measured depth differs from the mesh's by more than theta_z
-    shows something else than the mesh.
+    Device depth masks what the mesh lacks: see `shows_something_else`.
     """
     assert views and all(
         (v.camera.width, v.camera.height) == (views[0].camera.width, views[0].camera.height) for v in views
@@ -106,7 +110,7 @@ def build_view_maps(atlas: Atlas, views: tuple[View, ...], kind: str, allocate: 
     for index, (view, fragments) in enumerate(zip(there, rasterized, strict=True)):
         hit = fragments.face_index >= 0
         if view.depth is not None:
-            hit = hit & ((view.depth == 0) | ((view.depth - fragments.depth).abs() < tolerance))
+            hit = hit & ~shows_something_else(view.depth, fragments.depth, tolerance)
         if view.mask is not None:
             hit = hit & view.mask
         corners = mesh.v_uv[mesh.t_uv_idx[fragments.face_index.clamp(min=0).long()]]
@@ -130,6 +134,18 @@ def build_view_maps(atlas: Atlas, views: tuple[View, ...], kind: str, allocate: 
         width=width,
         height=height,
     )
+
+
+def shows_something_else(measured: Tensor, rendered: Tensor, tolerance: float) -> Tensor:
+    """[H,W] bool: pixels whose measured depth differs from the mesh's by the tolerance or more, and those without a
+    reading that have such a pixel near them (`UNMEASURED`).
+
+    measured: [H,W] metres along z, 0 = no reading. rendered: the same of the mesh, 0 = nothing hit.
+    """
+    read = measured > 0
+    differs = read & ((measured - rendered).abs() >= tolerance)
+    near = window_sums(differs[None].to(torch.int16), round(UNMEASURED * measured.shape[1]))[0] > 0
+    return differs | (near & ~read)
 
 
 def foregrounds(maps: ViewMaps) -> Tensor:

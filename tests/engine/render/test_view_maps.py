@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -14,11 +15,11 @@ from advtex_engine.core.cameras import project, unproject
 from advtex_engine.core.scene import Atlas, Camera, Mesh, View
 from advtex_engine.ingest.shrink import shrink
 from advtex_engine.refine.points import surface_depths
-from advtex_engine.render import pairs
+from advtex_engine.render import pairs, view_maps
 from advtex_engine.render.pairs import example_differences, overlaps, related_pairs
 from advtex_engine.render.reproject import reproject, unproject_pixels
-from advtex_engine.render.texture import decode_uv
-from advtex_engine.render.view_maps import UNMEASURED, ViewMaps, build_view_maps, shows_something_else
+from advtex_engine.render.texture import decode_uv, touched_slots
+from advtex_engine.render.view_maps import UNMEASURED, ViewMaps, build_view_maps, contradicted
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 
@@ -32,6 +33,9 @@ def scene_mesh() -> Mesh:
     return Mesh(torch.tensor(wall + card), faces, torch.tensor(uv), faces)
 
 
+ATLAS = Atlas(scene_mesh(), 256, 256, "scan", 2)
+
+
 def camera_at(x: float, turn: float = 0.0) -> Camera:
     K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64)
     angle = torch.tensor(turn).deg2rad().double()
@@ -43,16 +47,20 @@ def camera_at(x: float, turn: float = 0.0) -> Camera:
 
 
 def maps_of(cameras: list[Camera], depth: torch.Tensor | None = None, mask: torch.Tensor | None = None) -> ViewMaps:
-    """Every view's color codes its pixels: red = column, green = row, blue = view."""
-    mesh = scene_mesh()
-    views = []
-    for index, camera in enumerate(cameras):
-        color = torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8)
-        color[..., 0] = torch.arange(WIDTH)
-        color[..., 1] = torch.arange(HEIGHT)[:, None]
-        color[..., 2] = index
-        views.append(View(f"view{index}", camera, color, depth, mask))
-    return build_view_maps(Atlas(mesh, 256, 256, "scan", 2), tuple(views), "object")
+    """Views that tell by blue which they are."""
+    views = [viewed(camera, depth, mask, blue=index) for index, camera in enumerate(cameras)]
+    return build_view_maps(ATLAS, tuple(views), "object")
+
+
+def viewed(
+    camera: Camera, depth: torch.Tensor | None = None, mask: torch.Tensor | None = None, *, blue: int = 0
+) -> View:
+    """Its color codes its pixels: red = column, green = row."""
+    color = torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8)
+    color[..., 0] = torch.arange(WIDTH)
+    color[..., 1] = torch.arange(HEIGHT)[:, None]
+    color[..., 2] = blue
+    return View(f"view{blue}", camera, color, depth, mask)
 
 
 def test_what_a_mask_leaves_out_is_background() -> None:
@@ -96,15 +104,39 @@ def test_device_depth_that_contradicts_the_mesh_is_background() -> None:
     measured[:10] = 1.5
     measured[10:20] = 0
     depth = maps_of([camera_at(0.0)], measured).depth[0].view(HEIGHT, WIDTH)
-    reach = round(WIDTH * UNMEASURED)
-    assert 0 < reach < 10
-    assert (depth[: 10 + reach] == 0).all(), "a reading speaks for pixels near it that have none"
-    assert (depth[10 + reach : 20, : WIDTH // 4] > 0).all()
+    assert (depth[10 + round(WIDTH * UNMEASURED) : 20, : WIDTH // 4] > 0).all()
     assert (depth[HEIGHT // 2, WIDTH // 2] == 0).all(), "the card is nearer than measured"
 
 
+def test_a_reading_speaks_for_pixels_near_it_that_have_none_but_where_nothing_else_shows_the_surface(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Rows 5 to 30 have no reading; above them lies something else. Two pixels of the wall are some four texels."""
+    monkeypatch.setattr(view_maps, "UNMEASURED", 25 / WIDTH)
+    measured = torch.full((HEIGHT, WIDTH), 2.0)
+    measured[:5] = 1.5
+    measured[5:30] = 0
+    corner = np.s_[:, : WIDTH // 4]
+    alone = maps_of([camera_at(0.0)], measured)
+    depth = alone.depth[0].view(HEIGHT, WIDTH)[corner]
+    assert (depth[:5] == 0).all()
+    assert (depth[5:27] > 0).all()
+    assert (depth[28:30] == 0).all(), "what the pixels below them show"
+    assert (depth[30:] > 0).all()
+    seen = build_view_maps(ATLAS, (viewed(camera_at(0.0), measured), viewed(camera_at(0.0), measured * 0)), "object")
+    depth = seen.depth[0].view(HEIGHT, WIDTH)[corner]
+    assert (depth[:30] == 0).all(), "another view shows all of it"
+    assert (depth[30:] > 0).all()
+    assert (seen.depth[1].view(HEIGHT, WIDTH)[corner] > 0).all()
+    # Every texel that a foreground pixel samples has a slot, and none else.
+    for maps in (alone, seen):
+        foreground = maps.depth.view(maps.count, HEIGHT, WIDTH) > 0
+        codes = maps.uv.view(maps.count, HEIGHT, WIDTH, 2)
+        assert torch.equal(touched_slots(codes, foreground, 256, 256)[0], maps.slot_map)
+
+
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.02, 0.5, 1.0]))
-def test_what_shows_something_else_is_what_its_plain_twin_says(seed: int, unmeasured: float) -> None:
+def test_what_is_contradicted_is_what_its_plain_twin_says(seed: int, unmeasured: float) -> None:
     generator = torch.Generator().manual_seed(seed)
     measured, rendered = (1 + torch.rand(23, 110, generator=generator) * scale for scale in (0.104, 0.1))
     measured[torch.rand(measured.shape, generator=generator) < unmeasured] = 0
@@ -113,7 +145,9 @@ def test_what_shows_something_else_is_what_its_plain_twin_says(seed: int, unmeas
     for row, column in (measured == 0).nonzero().tolist():
         window = differs[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
         expected[row, column] = window.any()
-    assert torch.equal(shows_something_else(measured, rendered, 0.1), expected)
+    found, doubtful = contradicted(measured, rendered, 0.1)
+    assert torch.equal(found, differs)
+    assert torch.equal(doubtful, expected & ~differs)
 
 
 def pixel_points(maps: ViewMaps, view: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -17,7 +17,7 @@ from advtex_engine.core.scene import Atlas, View
 from advtex_engine.render.filtering import window_sums
 from advtex_engine.render.prefetch import uploaded
 from advtex_engine.render.rasterize import rasterize_views
-from advtex_engine.render.texture import encode_uv, number_slots, touched_slots
+from advtex_engine.render.texture import decode_uv, encode_uv, number_slots, touched_slots
 
 DEPTH_TOLERANCE = {"object": 0.03, "scene": 0.1}  # theta_z, metres (paper section 3.3)
 BYTES_PER_PIXEL = 9
@@ -26,6 +26,7 @@ TOGETHER = 32  # views of the host that are on the device at once
 UNMEASURED = 1 / 50
 """Of an image's width: how far a reading speaks for pixels that have none. Depth cameras measure nothing beside what
 stands in front of something else, and depth that is seen from the color camera has gaps there."""
+NEIGHBORS = 4  # texels: a surface counts as seen where one so near is, since views from afar skip some
 
 Allocate = Callable[[tuple[int, ...], torch.dtype], Tensor]
 """Shape and type -> a tensor with any content, where views are to be kept."""
@@ -91,7 +92,9 @@ def build_view_maps(atlas: Atlas, views: tuple[View, ...], kind: str, allocate: 
 
     allocate: makes what color, uv and depth are kept in; by default on the mesh's device.
 
-    Device depth masks what the mesh lacks: see `shows_something_else`.
+    Device depth masks what the mesh lacks: a pixel whose measured depth differs from the mesh's by more than theta_z
+    shows something else than the mesh. So do pixels near it that have no reading (`UNMEASURED`), but for those of a
+    surface that no other pixel shows.
     """
     assert views and all(
         (v.camera.width, v.camera.height) == (views[0].camera.width, views[0].camera.height) for v in views
@@ -109,18 +112,22 @@ def build_view_maps(atlas: Atlas, views: tuple[View, ...], kind: str, allocate: 
     there = uploaded(views, device, with_color=color.device == device)
     for index, (view, fragments) in enumerate(zip(there, rasterized, strict=True)):
         hit = fragments.face_index >= 0
-        if view.depth is not None:
-            hit = hit & ~shows_something_else(view.depth, fragments.depth, tolerance)
         if view.mask is not None:
             hit = hit & view.mask
+        shown = fragments.depth
+        if view.depth is not None:
+            differs, doubtful = contradicted(view.depth, fragments.depth, tolerance)
+            hit = hit & ~differs
+            shown = torch.where(doubtful, -shown, shown)
         corners = mesh.v_uv[mesh.t_uv_idx[fragments.face_index.clamp(min=0).long()]]
         color[index] = view.color.view(-1, 3)
         uv[index] = encode_uv((corners * fragments.barycentric[..., None]).sum(2)).view(-1, 2)
-        depth[index] = torch.where(hit, fragments.depth, 0.0).flatten()
+        depth[index] = torch.where(hit, shown, 0.0).flatten()
         if index % TOGETHER == TOGETHER - 1 or index == count - 1:
             newest = slice(index - index % TOGETHER, index + 1)
             codes, seen = uv[newest].to(device), depth[newest].to(device) > 0
             touched |= touched_slots(codes[:, None], seen[:, None], atlas.width, atlas.height)[0] >= 0
+    touched |= _give_doubtful(uv, depth, touched)
     slot_map, slots = number_slots(touched)
     K = torch.stack([view.camera.K for view in views])
     return ViewMaps(
@@ -136,7 +143,7 @@ def build_view_maps(atlas: Atlas, views: tuple[View, ...], kind: str, allocate: 
     )
 
 
-def shows_something_else(measured: Tensor, rendered: Tensor, tolerance: float) -> Tensor:
+def contradicted(measured: Tensor, rendered: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
     """[H,W] bool: pixels whose measured depth differs from the mesh's by the tolerance or more, and those without a
     reading that have such a pixel near them (`UNMEASURED`).
 
@@ -145,7 +152,30 @@ def shows_something_else(measured: Tensor, rendered: Tensor, tolerance: float) -
     read = measured > 0
     differs = read & ((measured - rendered).abs() >= tolerance)
     near = window_sums(differs[None].to(torch.int16), round(UNMEASURED * measured.shape[1]))[0] > 0
-    return differs | (near & ~read)
+    return differs, near & ~read
+
+
+def _give_doubtful(uv: Tensor, depth: Tensor, touched: Tensor) -> Tensor:
+    """Makes pixels whose depth is negative background, or foreground where they show what no other pixel does.
+
+    uv, depth: of `ViewMaps`; depth is changed. touched: [H,W] bool, texels that the other pixels show. -> [H,W] bool,
+    texels that are shown besides.
+    """
+    height, width = touched.shape
+    besides = torch.zeros_like(touched)
+    near: Tensor | None = None
+    for codes, stored in zip(uv, depth, strict=True):
+        doubtful = stored < 0
+        if not bool(doubtful.any()):
+            continue
+        if near is None:
+            near = window_sums(touched[None].to(torch.int16), NEIGHBORS)[0] > 0
+        some = codes[doubtful].to(touched.device)
+        column, row = (decode_uv(some) * touched.new_tensor([width, height], dtype=torch.float32)).long().unbind(1)
+        only = ~near[row.clamp(max=height - 1), column.clamp(max=width - 1)]
+        stored[doubtful] = torch.where(only.to(stored.device), -stored[doubtful], 0.0)
+        besides |= touched_slots(some[None, None], only[None, None], width, height)[0] >= 0
+    return besides
 
 
 def foregrounds(maps: ViewMaps) -> Tensor:

@@ -17,7 +17,7 @@ from advtex_engine.core.scene import Atlas, View
 from advtex_engine.render.filtering import window_sums
 from advtex_engine.render.prefetch import uploaded
 from advtex_engine.render.rasterize import rasterize_views
-from advtex_engine.render.texture import decode_uv, encode_uv, number_slots, touched_slots
+from advtex_engine.render.texture import bilinear_footprint, decode_uv, encode_uv, number_slots, touched_slots
 
 DEPTH_TOLERANCE = {"object": 0.03, "scene": 0.1}  # theta_z, metres (paper section 3.3)
 BYTES_PER_PIXEL = 9
@@ -162,6 +162,7 @@ def _give_doubtful(uv: Tensor, depth: Tensor, touched: Tensor) -> Tensor:
     texels that are shown besides.
     """
     height, width = touched.shape
+    size = torch.tensor([width, height], dtype=torch.float32, device=touched.device)
     besides = torch.zeros_like(touched)
     near: Tensor | None = None
     for codes, stored in zip(uv, depth, strict=True):
@@ -170,11 +171,12 @@ def _give_doubtful(uv: Tensor, depth: Tensor, touched: Tensor) -> Tensor:
             continue
         if near is None:
             near = window_sums(touched[None].to(torch.int16), NEIGHBORS)[0] > 0
-        some = codes[doubtful].to(touched.device)
-        column, row = (decode_uv(some) * touched.new_tensor([width, height], dtype=torch.float32)).long().unbind(1)
+        place = decode_uv(codes[doubtful].to(touched.device)) * size
+        column, row = place.long().unbind(1)
         only = ~near[row.clamp(max=height - 1), column.clamp(max=width - 1)]
         stored[doubtful] = torch.where(only.to(stored.device), -stored[doubtful], 0.0)
-        besides |= touched_slots(some[None, None], only[None, None], width, height)[0] >= 0
+        texels, weights = bilinear_footprint(place[only], width, height)
+        besides.view(-1)[texels[weights > 0]] = True
     return besides
 
 

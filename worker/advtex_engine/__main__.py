@@ -171,7 +171,7 @@ def evaluate(
         bool, typer.Option("--refine-heldout", help="refine the frames' poses against the model first, and say so")
     ] = False,
     budget: Annotated[
-        bool, typer.Option("--budget", help="split LPIPS into what pose, tone, displacement and content cost")
+        bool, typer.Option("--budget", help="split LPIPS into what pose, tone, displacement, motion and content cost")
     ] = False,
     json_: Annotated[Path | None, typer.Option("--json", help="write the scores per view and their means")] = None,
     contact_sheet: Annotated[Path | None, typer.Option(help="write a PNG: photograph, render, difference")] = None,

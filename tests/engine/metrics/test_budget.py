@@ -21,9 +21,11 @@ from advtex_engine.metrics.budget import (
     COSTS,
     LPIPS_SCORES,
     TABLE,
+    along_motion,
     budget_scores,
     corrected_tone,
     dense_flow,
+    own_motion,
     warped,
 )
 from advtex_engine.metrics.evaluate import Scores, compare, view_budget
@@ -86,6 +88,16 @@ def blurred(image: Tensor) -> Tensor:
     return torch.from_numpy(cv2.GaussianBlur(image.numpy(), (0, 0), 2.0))
 
 
+def shaken(image: Tensor, pixels: float, angle: float) -> Tensor:
+    """The mean of what a camera sees on its way along a straight line."""
+    shown = []
+    for step in np.linspace(-0.5, 0.5, 33):
+        matrix = np.float32([[1, 0, pixels * step * np.cos(angle)], [0, 1, pixels * step * np.sin(angle)]])
+        way = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        shown.append(cv2.warpAffine(image.numpy(), matrix, (WIDTH, HEIGHT), flags=way, borderMode=cv2.BORDER_REFLECT))
+    return torch.from_numpy(np.mean(shown, axis=0))
+
+
 def vignetted(image: Tensor) -> Tensor:
     columns = torch.linspace(-1, 1, WIDTH)[:, None]
     return (image + 0.12 * columns).clamp(0, 1)
@@ -127,6 +139,34 @@ def test_what_blur_costs_is_content(photo: Tensor, lpips: Lpips) -> None:
     assert share(scores, "content_cost") > 0.9
     assert scores["displacement_pixels"] is not None
     assert scores["displacement_pixels"] < 0.5
+
+
+@pytest.mark.parametrize(("pixels", "angle"), [(5.0, 0.0), (7.0, 0.6), (5.0, 2.2)])
+def test_what_the_photograph_s_own_motion_costs_is_motion(
+    photo: Tensor, lpips: Lpips, pixels: float, angle: float
+) -> None:
+    scores = of_image(photo, shaken(photo, pixels, angle), lpips)
+    assert share(scores, "motion_cost") > 0.6
+    found, direction = own_motion(photo, shaken(photo, pixels, angle), region())
+    assert found == pytest.approx(pixels, rel=0.45)
+    off = (direction - angle + np.pi / 2) % np.pi - np.pi / 2
+    assert abs(off) <= np.pi / 12
+
+
+def test_no_motion_excuses_a_texture_that_is_soft_or_moved_itself(photo: Tensor, lpips: Lpips) -> None:
+    for image in (photo, blurred(photo), shaken(photo, 7.0, 0.6), moved(photo, smooth_flow(3.0))):
+        scores = of_image(image, photo, lpips)
+        assert scores["motion_pixels"] == 0
+        assert scores["motion_cost"] == 0
+
+
+def test_a_motion_s_blur_keeps_what_is_even_and_what_is_not_known(photo: Tensor) -> None:
+    mask = region()
+    smeared = along_motion(photo, mask, 7.0, 0.6)
+    assert torch.equal(smeared[~mask], photo[~mask])
+    assert not torch.equal(smeared[mask], photo[mask])
+    even = torch.where(mask[..., None], 0.5, photo)
+    assert torch.allclose(along_motion(even, mask, 7.0, 0.6), even, atol=1e-6)
 
 
 def test_what_a_wrong_pose_costs_is_pose(photo: Tensor, lpips: Lpips) -> None:

@@ -10,17 +10,23 @@ One thing after the other is put right in the render, in this order, and LPIPS o
 3. displacement: a dense flow moves the render onto the photograph. It is smooth, so it cannot copy detail, and pixels
    stay that would come from where none count; what wrong geometry, cameras and misplaced texture cost beyond its reach
    counts as content.
-4. content: what is left. Blur, seams, clipped lights, parts that the mesh lacks.
+4. motion: the photograph's own blur along one direction, put onto the render. It is found by energies of gradients,
+   direction by direction, which a render that is softer than its photograph has less of: no blur is found then, and
+   none can hide that the texture lacks detail.
+5. content: what is left. Softness, seams, clipped lights, parts that the mesh lacks.
 
 A part's cost is the LPIPS before it was put right less that after it, and below 0 where that made things worse. The
-four sum to the raw figure. `lpips_corrected`, pose and tone put right, is what the texture answers for: a view's own
-camera and exposure are nobody's fault.
+five sum to the raw figure. `lpips_corrected`, pose and tone put right, is what the texture answers for: a view's own
+camera and exposure are nobody's fault. Nor is its motion, but what is blurred forgives a texture's faults, so that it
+is told beside.
 
 No correction reads a pixel outside of those that count, and none touches those where the model shows nothing.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -37,17 +43,19 @@ from advtex_engine.refine.exposure import BRIGHT, DARK, GAIN_RANGE, ROBUST_SCALE
 from advtex_engine.render.texture import fill_holes
 from advtex_engine.selection.toning import LARGEST, REACH
 
-COSTS = ("pose_cost", "tone_cost", "displacement_cost", "content_cost")
+COSTS = ("pose_cost", "tone_cost", "displacement_cost", "motion_cost", "content_cost")
 LPIPS_SCORES = ("lpips_corrected", *COSTS)
 TABLE = {
     "lpips": "LPIPS",
     "pose_cost": "= pose",
     "tone_cost": "+ tone",
     "displacement_cost": "+ displacement",
+    "motion_cost": "+ motion",
     "content_cost": "+ content",
     "lpips_corrected": "corrected",
     "pose_pixels": "pose off, px",
     "displacement_pixels": "displaced, px",
+    "motion_pixels": "moved by, px",
     "flat_energy": "flat energy",
 }
 """Columns of `format_budget`."""
@@ -58,6 +66,12 @@ FLOW_REACH = 1 / 80
 """Of the view's width, the standard deviation of the flow's smoothing."""
 INSIDE = 0.999
 """Share of a sample of the render that must lie on pixels that count."""
+MOTION_PIXELS = (1.75, 2.5, 3.5, 5.0, 7.0, 10.0)
+MOTION_ANGLES = 12
+ACROSS = 0.2
+"""Pixels, the deviation of a motion's blur across it: thin, so that the directions beside it keep their energies."""
+DIRECTIONS = 6
+"""Along which gradients are compared, to find a motion."""
 
 Array = NDArray[Any]  # float32; OpenCV does not say
 Mask = NDArray[np.bool_]
@@ -66,7 +80,8 @@ Mask = NDArray[np.bool_]
 def budget_scores(
     photo: Tensor, image: Tensor, posed: Tensor, mask: Tensor, known: Tensor, lpips: Lpips | None
 ) -> dict[str, float | None]:
-    """LPIPS_SCORES of a view, None without LPIPS, and `displacement_pixels`, None where the model shows nothing.
+    """LPIPS_SCORES of a view, None without LPIPS; `displacement_pixels`, None where the model shows nothing, and
+    `motion_pixels`, how far the photograph's camera moved while it was exposed.
 
     photo, image: [H,W,3] float32 sRGB in [0,1], the photograph and the render at the given pose. posed: the render at
     the refined pose. mask: [H,W] bool, the pixels that count; known: those of them where `posed` shows the model.
@@ -75,11 +90,15 @@ def budget_scores(
     toned = corrected_tone(posed, photo, known)
     flow = dense_flow(toned, photo, known)
     moved = warped(toned, flow, known)
+    pixels, angle = own_motion(moved, photo, known)
+    smeared = along_motion(moved, known, pixels, angle)
     scores: dict[str, float | None] = dict.fromkeys((*LPIPS_SCORES, "displacement_pixels"))
+    scores["motion_pixels"] = pixels
     if lpips is not None:
         truth = Photograph(photo, mask)
-        raw, after_pose, corrected, after_flow = (lpips.masked(one, truth) for one in (image, posed, toned, moved))
-        costs = (raw - after_pose, after_pose - corrected, corrected - after_flow, after_flow)
+        after = [lpips.masked(one, truth) for one in (image, posed, toned, moved, smeared)]
+        corrected = after[2]
+        costs = [*(before - then for before, then in itertools.pairwise(after)), after[-1]]
         scores |= {"lpips_corrected": corrected, **dict(zip(COSTS, costs, strict=True))}
     if bool(known.any()):
         detail = _detail(photo, known)[known]
@@ -146,6 +165,61 @@ def warped(image: Tensor, flow: Tensor, known: Tensor) -> Tensor:
     moved = cv2.remap(fill_holes(image, known).numpy(), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     share = cv2.remap(inside.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     return torch.from_numpy(np.where((inside & (share > INSIDE))[..., None], np.clip(moved, 0, 1), picture))
+
+
+def own_motion(image: Tensor, photo: Tensor, known: Tensor) -> tuple[float, float]:
+    """Length (pixels) and direction (radians, from right to down) of the motion that blurred the photograph and not the
+    image, 0 pixels for none; of those looked at the one after which gradients' energies are as the photograph's.
+
+    image, photo: [H,W,3] in [0,1], where `known` [H,W].
+    """
+    inside = cv2.erode(known.to(torch.uint8).numpy(), np.ones((3, 3), np.uint8), borderValue=0) > 0
+    ours, theirs = (luminance(fill_holes(picture, known)).numpy() for picture in (image, photo))
+    wanted = _gradient_energies(theirs, inside)
+
+    def unlike(pixels: float, angle: float) -> float:
+        energies = _gradient_energies(_smeared(ours, pixels, angle), inside)
+        return float(np.square(np.log((energies + 1e-6) / (wanted + 1e-6))).sum())
+
+    angles = [math.pi * number / MOTION_ANGLES for number in range(MOTION_ANGLES)]
+    motions = [(0.0, 0.0), *itertools.product(MOTION_PIXELS, angles)]
+    return min(motions, key=lambda motion: unlike(*motion))
+
+
+def _gradient_energies(gray: Array, inside: Mask) -> Array:
+    """[DIRECTIONS]: sums of squared differences along each, of pixels two apart."""
+    right, down = np.zeros_like(gray), np.zeros_like(gray)
+    right[:, 1:-1], down[1:-1] = gray[:, 2:] - gray[:, :-2], gray[2:] - gray[:-2]
+    right, down = right[inside].astype(np.float64), down[inside].astype(np.float64)
+    angles = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
+    cosine, sine = np.cos(angles), np.sin(angles)
+    energies: Array = right @ right * cosine**2 + 2 * (right @ down) * cosine * sine + down @ down * sine**2
+    return energies
+
+
+def along_motion(image: Tensor, known: Tensor, pixels: float, angle: float) -> Tensor:
+    """The image [H,W,3] as a camera shows it that moves by so many pixels; what is not `known` [H,W] stays, and is
+    brought in nowhere."""
+    if pixels == 0:
+        return image
+    weight = known.to(torch.float32).numpy()
+    share = np.maximum(_smeared(weight, pixels, angle), 1e-6)
+    smeared = _smeared(image.numpy() * weight[..., None], pixels, angle) / share[..., None]
+    return torch.from_numpy(np.where(weight[..., None] > 0, smeared, image.numpy()).astype(np.float32))
+
+
+def _smeared(picture: Array, pixels: float, angle: float) -> Array:
+    """Means along a line, with the weights of a Gaussian as wide as the line: motions are no uniform ones."""
+    if pixels == 0:
+        return picture
+    deviation = pixels / 12**0.5
+    reach = math.ceil(3 * deviation)
+    steps = np.arange(-reach, reach + 1)
+    x, y = np.meshgrid(steps, steps)
+    along, beside = x * math.cos(angle) + y * math.sin(angle), y * math.cos(angle) - x * math.sin(angle)
+    kernel = np.exp(-((along / deviation) ** 2 + (beside / ACROSS) ** 2) / 2)
+    smeared: Array = cv2.filter2D(picture, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
+    return smeared
 
 
 def _detail(photo: Tensor, known: Tensor) -> Tensor:

@@ -110,8 +110,9 @@ def evaluate(
     decides which pixels count, by default the scan's mesh; models compared with each other need the same one. weights:
     see `perceptual.weights_folder`; without them `lpips` and `lpips_full` are None. sheet: PNG to write, photograph |
     render | difference. refine_poses: the frames' poses are refined against the model first, to tell a texture that is
-    displaced from one that is wrong. budget: LPIPS is split into what pose, tone, displacement and content cost
-    (`budget.py`). Raises ScanError, ModelError, OptionError, and EngineError when no view can be scored.
+    displaced from one that is wrong. budget: LPIPS is split into what pose, tone, displacement, the photographs' motion
+    and content cost (`budget.py`). Raises ScanError, ModelError, OptionError, and EngineError when no view can be
+    scored.
     """
     scene = heldout_scene(scan, TextureConfig(size=size, holdout=holdout, layout=layout), monitor or Monitor())
     target = scene.mesh if reference is None else load_reference(reference)

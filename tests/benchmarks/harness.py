@@ -282,8 +282,12 @@ def shown_mean(cells: Sequence[Mapping[str, Any]], name: str) -> float | str:
     return mean_of(cells, name) if all(name in cell["scores"] for cell in cells) else "-"
 
 
-def geometric_means(label: str, lines: Mapping[str, Sequence[Mapping[str, Any] | None]]) -> str:
-    """A section with COMPARED_SCORES over scans; empty for one scan. lines: per row its cell of each scan.
+def geometric_means(
+    label: str,
+    lines: Mapping[str, Sequence[Mapping[str, Any] | None]],
+    scores: Mapping[str, str] = COMPARED_SCORES,
+) -> str:
+    """A section with scores over scans; empty for one scan. lines: per row its cell of each scan.
 
     Rows that lack a scan are left out: what is easy would be compared with what is not.
     """
@@ -291,8 +295,8 @@ def geometric_means(label: str, lines: Mapping[str, Sequence[Mapping[str, Any] |
     count = max(map(len, whole.values()), default=0)
     if count < 2:
         return ""
-    rows = [[name, *(geometric_mean(cells, score) for score in COMPARED_SCORES)] for name, cells in whole.items()]
-    return f"\n## Geometric mean over {count} scans\n\n{markdown_table([label, *COMPARED_SCORES.values()], rows)}"
+    rows = [[name, *(geometric_mean(cells, score) for score in scores)] for name, cells in whole.items()]
+    return f"\n## Geometric mean over {count} scans\n\n{markdown_table([label, *scores.values()], rows)}"
 
 
 def geometric_mean(cells: Sequence[Mapping[str, Any]], name: str) -> float | str:

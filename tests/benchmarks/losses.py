@@ -6,7 +6,8 @@ From the start of the preset `standard` the texture takes the same steps each ti
 the same view, by nothing but one loss; Adam's rate is the preset's and falls as there. The last state is scored on
 views that are held out. "gabor" is the term of `adversarial/gabor.py`, the lines below it change one of its constants;
 "no maximum" compares energies where they are. Features are those of a PatchGAN that has learned nothing, and of VGG16
-up to relu3_3.
+up to relu3_3. "lpips" is LPIPS of AlexNet itself, which scores, too: what a texture gains that is tuned to its ruler.
+So each is scored by another ruler as well, LPIPS of VGG16, where that has weights.
 
 Writes losses.json (a cell per scan and loss) and losses.md below --results; goes on with missing cells when run again.
 """
@@ -25,11 +26,13 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from harness import (
+    COMPARED_SCORES,
     RESULTS,
     Results,
     completed,
     geometric_means,
     markdown_table,
+    on_cpu,
     parsed_size,
     prepare,
     score_model,
@@ -48,6 +51,8 @@ from advtex_engine.core.config import TextureConfig
 from advtex_engine.methods import MethodInput
 from advtex_engine.methods.mean import dense_texture
 from advtex_engine.methods.vgg import load_vgg
+from advtex_engine.metrics.evaluate import compare, heldout_scene, view_budget
+from advtex_engine.metrics.lpips import Lpips, WeightsError, load_lpips, unlike
 from advtex_engine.render.pairs import own_pairs
 from advtex_engine.render.texture import sample_texels
 from advtex_engine.runtime.devices import choose_device
@@ -71,11 +76,12 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "4 octaves": {"OCTAVES": 4},
     "wavelength 4": {"WAVELENGTH": 4.0, "SIZE": 9},
 }
-OTHERS = ("start", "l1", "ssim", "untrained discriminator", "vgg16")
+OTHERS = ("start", "l1", "ssim", "untrained discriminator", "vgg16", "lpips")
 NAMES = (*OTHERS, *VARIANTS)
 COLUMNS = {
     "lpips": "LPIPS",
     "lpips_corrected": "corrected LPIPS",
+    "lpips_vgg16": "corrected LPIPS of VGG16",
     "gradient_ratio": "gradient ratio",
     "flat_energy": "energy where flat",
     "psnr": "PSNR",
@@ -111,8 +117,8 @@ def constants(changed: Mapping[str, Any]) -> Iterator[None]:
             setattr(gabor, name, value)
 
 
-def loss_named(name: str, device: torch.device) -> Loss:
-    """One of NAMES but "start"; for those of VARIANTS inside `constants`."""
+def loss_named(name: str, device: torch.device, weights: Path | None = None) -> Loss:
+    """One of NAMES but "start"; for those of VARIANTS inside `constants`. weights: folder of LPIPS's."""
     if name in VARIANTS:
         return partial(gabor.gabor_loss, filters=gabor.gabor_filters(device))
     if name == "l1":
@@ -122,6 +128,8 @@ def loss_named(name: str, device: torch.device) -> Loss:
     if name == "vgg16":
         network = load_vgg().to(device)
         return lambda render, photograph, _: _distance(network((render + 1) / 2), network((photograph + 1) / 2))
+    if name == "lpips":
+        return partial(lpips_loss, load_lpips(weights).to(device))
     discriminator = PatchDiscriminator(torch.Generator().manual_seed(0)).to(device)
 
     def responses(image: Tensor, photograph: Tensor) -> list[Tensor]:
@@ -139,6 +147,13 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
     )
     luminance = (2 * mean_a * mean_b + 0.01**2) / (mean_a.square() + mean_b.square() + 0.01**2)
     return luminance * (2 * together + 0.03**2) / (variance_a + variance_b + 0.03**2)
+
+
+def lpips_loss(lpips: Lpips, render: Tensor, photograph: Tensor, _: Tensor) -> Tensor:
+    """What `Lpips.__call__` says of two images [1,3,h,w] in [-1,1], with a gradient for the render."""
+    ours, theirs = (lpips.stack((image + 1) / 2) for image in (render, photograph))
+    layers = [unlike(*features).mean() for features in zip(ours, theirs, lpips.heads, strict=True)]
+    return torch.stack(layers).sum()
 
 
 def _distance(first: list[Tensor], second: list[Tensor]) -> Tensor:
@@ -166,6 +181,22 @@ def descended(given: MethodInput, loss: Loss, steps: int) -> tuple[Tensor, float
     return values.detach(), 1000 * (time.perf_counter() - began) / max(steps, 1)
 
 
+def by_vgg16(given: MethodInput, texture: Tensor, scan: Path, weights: Path | None) -> dict[str, float]:
+    """`lpips_vgg16`: mean over held-out frames, with their pose and tone put right; empty without weights."""
+    try:
+        lpips = load_lpips(weights, "vgg16")
+    except WeightsError:
+        return {}
+    scene, atlas = heldout_scene(scan, given.config, given.monitor), on_cpu(given.atlas)
+    found = []
+    for view in scene.views:
+        comparison = compare(atlas, texture, view, scene.mesh)
+        if comparison is not None:
+            budget = view_budget(atlas, texture, view, comparison, scene.mesh, scene.kind, lpips)
+            found.append(budget["lpips_corrected"] or 0.0)
+    return {"lpips_vgg16": sum(found) / len(found)}
+
+
 def run(arguments: argparse.Namespace, results: Results) -> None:
     for scan in arguments.scans:
         settings = {"size": arguments.scan_size, "steps": arguments.steps, "refined": not arguments.no_refine}
@@ -189,10 +220,11 @@ def run(arguments: argparse.Namespace, results: Results) -> None:
                 began = time.perf_counter()
                 with constants(VARIANTS.get(name, {})):
                     steps = 0 if name == "start" else arguments.steps
-                    loss = loss_named("l1" if name == "start" else name, device)
+                    loss = loss_named("l1" if name == "start" else name, device, arguments.lpips_weights)
                     values, ms = descended(given, loss, steps)
                 texture = completed(given, dense_texture(maps, values).clamp(0, 1))
                 scores = score_model(given, texture, scan, Path(folder) / "model", None, arguments.lpips_weights)
+                scores |= by_vgg16(given, texture, scan, arguments.lpips_weights)
                 results.add({**common, "loss": name}, {**scores, "ms": ms}, time.perf_counter() - began)
 
 
@@ -209,7 +241,8 @@ def report(arguments: argparse.Namespace, results: Results) -> None:
         body += f"\n## {title}\n\n{markdown_table(['loss', *COLUMNS.values()], rows)}"
     common = [name for name in NAMES if all(name in cells for cells in scans.values())]
     lines = {name: [cells[name] for cells in scans.values()] for name in common}
-    body += geometric_means("loss", lines)
+    scores = COMPARED_SCORES | {"lpips_vgg16": COLUMNS["lpips_vgg16"]}
+    body += geometric_means("loss", lines, scores)
     write_report(arguments.results / "losses.md", "By what a texture is compared", results.cells, body)
 
 

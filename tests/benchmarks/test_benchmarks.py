@@ -35,7 +35,7 @@ from advtex_engine.adversarial.discriminator import PatchDiscriminator
 from advtex_engine.adversarial.optimizer import AdversarialOptimizer
 from advtex_engine.core.config import TextureConfig
 from advtex_engine.methods import gabor
-from advtex_engine.metrics.lpips import NETWORKS
+from advtex_engine.metrics.lpips import NETWORKS, load_lpips
 from advtex_engine.synthetic import patches
 from advtex_engine.synthetic.real import drawn_scene
 from advtex_engine.synthetic.scan import synthesize
@@ -446,17 +446,22 @@ def test_probes_stand_beside_views_that_a_run_never_sees(desk: Path, tmp_path: P
     assert "## desk, 96x64, standard, 8 steps in turns of 3, seed 0, cameras as they are" in page
 
 
-def test_losses_are_compared_one_by_one(desk: Path, tmp_path: Path, weights: Path) -> None:
+def test_losses_are_compared_one_by_one(
+    desk: Path, tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(losses, "load_lpips", lambda folder, *_: load_lpips(folder))  # VGG16 takes long
     before = dict(vars(losses.gabor))
     line = [str(desk), "--scan-size", "96x64", "--faces", "600", "--steps", "4", "--device", "cpu"]
     line += ["--no-refine"]
-    names = ["start", "l1", "ssim", "untrained discriminator", "gabor", "no maximum", "4 orientations"]
+    names = ["start", "l1", "ssim", "untrained discriminator", "lpips", "gabor", "no maximum", "4 orientations"]
     for _ in range(2):  # the second time nothing is missing
         losses.main([*line, "--losses", *names, "--lpips-weights", str(weights), "--results", str(tmp_path / "out")])
     cells = json.loads((tmp_path / "out" / "losses.json").read_text())["cells"]
     assert [cell["settings"]["loss"] for cell in cells] == names
     scores = {(cell["scores"]["lpips"], cell["scores"]["psnr"]) for cell in cells}
     assert len(scores) == len(names), "each is a loss of its own"
+    for found in (cell["scores"] for cell in cells):
+        assert found["lpips_vgg16"] == pytest.approx(found["lpips_corrected"], abs=1e-4), "the same ruler here"
     assert vars(losses.gabor) == before
     assert "## desk, 96x64, 4 steps, cameras as they are" in (tmp_path / "out" / "losses.md").read_text()
 

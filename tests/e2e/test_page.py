@@ -547,7 +547,7 @@ def test_every_page_is_open_to_all_and_fits_every_screen(web: Browsing, axe: str
 
 
 def look_at_all_sizes(page: Page, name: str, folder: Path, axe: str) -> None:
-    for width, scheme in ((1280, "dark"), (1280, "light"), (390, "light"), (390, "dark")):
+    for width, scheme in ((1280, "dark"), (1280, "light"), (390, "light"), (360, "dark")):
         page.set_viewport_size({"width": width, "height": 860})
         page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
         look(page, f"{name}-{width}-{scheme}", folder, axe if (width > 390) == (scheme == "light") else "")
@@ -559,6 +559,8 @@ def look(page: Page, name: str, folder: Path, axe: str) -> None:
     page.screenshot(path=folder / f"{name}.png", full_page=True)
     wide = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
     assert wide <= 0, f"{name} scrolls sideways"
+    heights = page.evaluate("[...document.querySelectorAll('.bar nav a')].map(link => link.offsetHeight)")
+    assert max(heights, default=0) < 40, f"{name}: a link of the bar takes two lines"
     if not axe:
         return
     page.evaluate(axe)

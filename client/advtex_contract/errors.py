@@ -123,6 +123,10 @@ JOB_EXPLANATIONS: Mapping[str, Explanation] = {
         "The scan's bytes are gone from the storage, or from the place that was referred to.",
         "Send the scan again, or put it back where it was and retry the job.",
     ),
+    "scan_damaged": Explanation(
+        "The storage holds other bytes of the scan than those that were uploaded.",
+        "Send the scan again, and tell the operator: the storage has lost or changed what it was given.",
+    ),
     "storage_refused": Explanation(
         "The storage keeps refusing: permission denied, or a bucket or folder that does not exist.",
         "The operator has to mend the storage; then retry the job.",

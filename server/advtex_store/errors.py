@@ -11,6 +11,7 @@ StoreError
 ├── ReferenceRefused      a scan's URL is malformed, or lies where nothing may be read
 │   └── ReferenceUnreadable   it lies where it may, and this service's user or keys have no right to read it
 ├── BlobNotFound
+├── ScanDamaged           the storage holds other bytes than were uploaded
 ├── ResultsUnreadable     what lists a job's results is there, and damaged
 ├── BlobsUnavailable      the storage cannot be reached now
 │   └── BlobsRefused          it answers and refuses: there is no such bucket, or the keys do not open it
@@ -67,6 +68,10 @@ class ReferenceUnreadable(ReferenceRefused):
 
 class BlobNotFound(StoreError):
     """No blob has this key."""
+
+
+class ScanDamaged(StoreError):
+    """A scan's stored bytes are not those that were uploaded."""
 
 
 class ResultsUnreadable(StoreError):

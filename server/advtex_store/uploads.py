@@ -77,6 +77,17 @@ class Uploads:
                 raise RecordNotFound(f"there is no upload {upload_id}")
             return row
 
+    def digest(self, upload_id: str) -> str | None:
+        """The SHA-256 of a complete upload's bytes, in hexadecimal digits; None if it is not complete, or gone."""
+        with self.database.read() as session:
+            found: str | None = session.scalar(select(UploadRow.sha256).where(UploadRow.id == upload_id))
+            return found
+
+    def distrust(self, upload_id: str) -> None:
+        """`find` finds it no more: whoever has its bytes sends them anew. They stay, should the storage be mended."""
+        with self.database.write() as session:
+            session.execute(update(UploadRow).where(UploadRow.id == upload_id).values(announced_sha256=None))
+
     def find(self, owner: str, sha256: str) -> list[UploadRow]:
         """Uploads that have these bytes, or are to have them: complete ones first, then those that came farthest."""
         with self.database.read() as session:

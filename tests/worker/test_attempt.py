@@ -141,6 +141,43 @@ def test_a_scan_that_is_gone_fails_the_job(store: Store, host: Hosts, new_job: N
     assert error["code"] == "scan_missing"
 
 
+def test_a_scan_that_the_storage_has_changed_fails_the_job_and_is_sent_anew(
+    store: Store, host: Hosts, new_job: NewJob
+) -> None:
+    job_id = new_job()
+    upload_id = store.records.job(job_id).upload_id
+    sha256 = store.uploads.digest(upload_id)
+    assert sha256 is not None
+    assert [row.id for row in store.uploads.find("owner", sha256)] == [upload_id]
+    store.blobs.put(keys.scan_key(upload_id), b"a scam")
+    run_attempt(host("quick"), job_id, 1)
+    row = store.records.job(job_id)
+    assert row.state == JobState.failed
+    assert row.error is not None
+    assert row.error["code"] == "scan_damaged"
+    assert store.uploads.find("owner", sha256) == [], "who sends the scan again is not told that it is there"
+    assert store.blobs.get(keys.scan_key(upload_id)) == b"a scam"
+
+
+def test_a_scan_that_was_damaged_on_its_way_is_fetched_again(
+    store: Store, host: Hosts, new_job: NewJob, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stream, told = type(store.blobs).stream, list[str]()
+
+    def damaged_once(self: Any, key: str, *arguments: Any) -> Any:
+        if key.startswith("scans/"):
+            told.append(key)
+            if len(told) == 1:
+                return iter([b"a longer ", b"scan"])
+        return stream(self, key, *arguments)
+
+    monkeypatch.setattr(type(store.blobs), "stream", damaged_once)
+    job_id = new_job()
+    run_attempt(host("quick"), job_id, 1)
+    assert store.records.job(job_id).state == JobState.succeeded
+    assert len(told) == 2
+
+
 @pytest.mark.one_machine("how engines end, wherever rows and blobs are")
 @pytest.mark.parametrize(
     ("engine", "sentence"),

@@ -19,6 +19,7 @@ from advtex_store import keys
 from advtex_store.errors import StoreError
 from advtex_store.queue import attempt_of
 from advtex_store.store import Store
+from advtex_worker.download import download_scan
 from advtex_worker.scan_cache import ScanCache, cache_name
 
 LOOK_SECONDS = 5.0  # between looks at what waits
@@ -75,16 +76,16 @@ class Ahead:
                 return
 
     def _download(self, upload: str) -> None:
-        key = keys.scan_key(upload)
-        size = self._store.blobs.head(key).size
+        size = self._store.blobs.head(keys.scan_key(upload)).size
         if size > self._cache.limit_bytes or ROOM * size > self._cache.free_bytes():
             return
 
+        def arrived(size: int) -> None:
+            self._moved(size)
+            self._check()
+
         def fill(file: IO[bytes]) -> None:
-            for chunk in self._store.blobs.stream(key):
-                file.write(chunk)
-                self._moved(len(chunk))
-                self._check()
+            download_scan(self._store, upload, file, arrived)
 
         with self._cache.held(cache_name(upload), fill, self._check):
             log.info("the scan of a waiting job is here", upload=upload)

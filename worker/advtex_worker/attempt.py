@@ -15,13 +15,14 @@ from advtex_contract.errors import ErrorDetail
 from advtex_contract.jobs import JobError
 from advtex_store import keys
 from advtex_store.counters import CHECKPOINT_DOWN, CHECKPOINT_UP, SCAN_DOWN
-from advtex_store.errors import BlobNotFound, ReferenceRefused, ResultsUnreadable, StaleAttempt
+from advtex_store.errors import BlobNotFound, ReferenceRefused, ResultsUnreadable, ScanDamaged, StaleAttempt
 from advtex_store.process_ends import how_it_ended
 from advtex_store.records import Claim
 from advtex_store.store import Store
 from advtex_worker.ahead import Ahead
 from advtex_worker.checkpoints import CheckpointUploader, restore
 from advtex_worker.child import Child
+from advtex_worker.download import download_scan
 from advtex_worker.events import (
     CheckpointEvent,
     DiskFullEvent,
@@ -134,6 +135,11 @@ class Attempt:
             error = JobError(code="scan_missing", message=str(missing) if self._claim.source else message)
             self._patience.record(lambda: self._store.records.fail(self._job_id, self._number, error))
             return
+        except ScanDamaged as damaged:
+            damage = JobError(code="scan_damaged", message=str(damaged))
+            self._patience.persist(lambda: self._store.uploads.distrust(self._claim.upload_id))
+            self._patience.record(lambda: self._store.records.fail(self._job_id, self._number, damage))
+            return
         if self._ahead is not None:
             self._ahead.start()
             self._stack.callback(self._ahead.stop)
@@ -179,10 +185,11 @@ class Attempt:
                 self._download(file)
 
     def _download(self, file: IO[bytes]) -> None:
-        for chunk in self._store.blobs.stream(self._claim.scan_key):
-            file.write(chunk)
-            self._keeper.moved(SCAN_DOWN, len(chunk))
+        def arrived(size: int) -> None:
+            self._keeper.moved(SCAN_DOWN, size)
             self._check_ending()
+
+        download_scan(self._store, self._claim.upload_id, file, arrived)
 
     def _check_ending(self) -> None:
         if self._keeper.ending:

@@ -19,6 +19,7 @@ from advtex_store.errors import (
     ReferenceRefused,
     ReferenceUnreadable,
     ResultsUnreadable,
+    ScanDamaged,
     StaleAttempt,
     StoreError,
 )
@@ -130,7 +131,7 @@ def _is_answer(error: Exception) -> bool:
     """Errors that say how things are: no other try would say otherwise."""
     if isinstance(error, ReferenceUnreadable):  # may be mended while the job waits
         return False
-    return isinstance(error, StaleAttempt | BlobNotFound | ReferenceRefused | ResultsUnreadable)
+    return isinstance(error, StaleAttempt | BlobNotFound | ScanDamaged | ReferenceRefused | ResultsUnreadable)
 
 
 def _is_refusal(error: Exception) -> bool:

@@ -62,9 +62,9 @@ Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "gabor": {},
-    "no maximum": {"WINDOW": 1, "STRIDE": 1},
-    "windows of 4": {"WINDOW": 4},
-    "windows of 12": {"WINDOW": 12},
+    "no maximum": {"WINDOW": 1},
+    "windows of 2": {"WINDOW": 2},
+    "windows of 8": {"WINDOW": 8},
     "faint 0.05": {"FAINT": 0.05},
     "faint 0.1": {"FAINT": 0.1},
     "faint 0.4": {"FAINT": 0.4},

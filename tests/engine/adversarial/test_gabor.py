@@ -17,7 +17,6 @@ from advtex_engine.adversarial.gabor import (
     ORIENTATIONS,
     SIZE,
     SPACING,
-    STRIDE,
     TINY,
     WAVELENGTH,
     WINDOW,
@@ -80,11 +79,11 @@ def twin_shares(gray: np.ndarray) -> list[np.ndarray]:
                 inside = SIZE // 2
                 energy += response[inside:-inside, inside:-inside] ** 2
             energies.append(np.sqrt(energy))
-        rows, columns = (1 + (side - (WINDOW - SPACING + 1)) // STRIDE for side in energies[0].shape)
+        rows, columns = (1 + (side - (WINDOW - SPACING + 1)) // WINDOW for side in energies[0].shape)
         places = slice(0, WINDOW, SPACING)
         greatest = np.array(
             [
-                [[e[STRIDE * r :, STRIDE * c :][places, places].max() for c in range(columns)] for r in range(rows)]
+                [[e[WINDOW * r :, WINDOW * c :][places, places].max() for c in range(columns)] for r in range(rows)]
                 for e in energies
             ]
         )

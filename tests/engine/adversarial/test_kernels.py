@@ -261,7 +261,7 @@ def test_the_l1_loss_is_torchs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize(
     ("size", "channels_last"),
-    [((56, 59), True), ((58, 57), False), ((30, 41), True), ((26, 25), False), ((14, 90), True)],
+    [((56, 59), True), ((58, 57), False), ((30, 41), True), ((17, 25), False), ((12, 90), True)],
     ids=["3 octaves", "3 octaves, contiguous", "2 octaves", "1 octave, contiguous", "1 row of windows"],
 )
 def test_the_gabor_loss_is_torchs(monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], channels_last: bool) -> None:
@@ -312,8 +312,8 @@ def test_a_flat_render_has_a_finite_gabor_gradient() -> None:
 
 
 def test_images_smaller_than_a_window_have_no_gabor_loss() -> None:
-    small = image(3, 12, 50, 0).requires_grad_()
-    loss = fused_gabor.gabor_loss(small, image(3, 12, 50, 1), torch.ones_like(small[:, :1]), gabor_filters(DEVICE))
+    small = image(3, 8, 50, 0).requires_grad_()
+    loss = fused_gabor.gabor_loss(small, image(3, 8, 50, 1), torch.ones_like(small[:, :1]), gabor_filters(DEVICE))
     assert float(loss) == 0 and not loss.requires_grad
 
 

@@ -24,8 +24,7 @@ WAVELENGTH = 3.0  # pixels
 ORIENTATIONS = 6
 SIZE = 7  # pixels a side of a filter
 OCTAVES = 3  # images of half the size each
-STRIDE = 4  # pixels between two windows
-WINDOW = 8  # pixels a side, of whose places the greatest energy counts; whole strides
+WINDOW = 4  # pixels a side, of whose places the greatest energy counts; windows lie side by side
 SPACING = 2
 """Pixels between two places of a filter, in rows and columns: energies are so smooth that those of every place lead to
 no better texture, in more than three times the time."""
@@ -83,17 +82,17 @@ def _shares(gray: Tensor, matrix: Tensor) -> list[Tensor]:
     """[1,h,w] -> per octave [1,ORIENTATIONS,...], for each window a vector that is shorter than 1."""
     found: list[Tensor] = []
     while len(found) < OCTAVES and min(gray.shape[-2:]) >= window_reach():
-        blocks: Tensor = _GreatestSquares.apply(gray[0], matrix)  # type: ignore[no-untyped-call]
-        energies = (F.max_pool2d(blocks[None], WINDOW // STRIDE, 1) + TINY).sqrt()
+        squares: Tensor = _GreatestSquares.apply(gray[0], matrix)  # type: ignore[no-untyped-call]
+        energies = (squares[None] + TINY).sqrt()
         found.append(energies / (energies.square().sum(1, keepdim=True) + FAINT**2).sqrt())
         gray = halved(gray)
     return found
 
 
 def _placed(filters: Tensor) -> Tensor:
-    """[2 ORIENTATIONS * places, side^2]: every filter at every place of a block of STRIDE x STRIDE pixels, as rows to
-    multiply a patch by, of so many pixels a side."""
-    places = list(itertools.product(range(0, STRIDE, SPACING), repeat=2))
+    """[2 ORIENTATIONS * places, side^2]: every filter at every place of a window, as rows to multiply a patch by, of so
+    many pixels a side."""
+    places = list(itertools.product(range(0, WINDOW, SPACING), repeat=2))
     side = SIZE + places[-1][0]
     placed = filters.new_zeros((len(filters), len(places), side, side))
     for number, (down, right) in enumerate(places):
@@ -102,16 +101,16 @@ def _placed(filters: Tensor) -> Tensor:
 
 
 class _GreatestSquares(torch.autograd.Function):
-    """Gray levels [h,w] -> [ORIENTATIONS,rows,columns], the greatest squared energy in each block of STRIDE^2 pixels.
+    """Gray levels [h,w] -> [ORIENTATIONS,rows,columns], the greatest squared energy in each window.
 
-    One product of matrices for all places of a block: a convolution of a single channel takes a CPU three times as
-    long, and its transpose seven times. The first of equal energies, row by row of the block, has the gradient.
+    One product of matrices for all places of a window: a convolution of a single channel takes a CPU three times as
+    long, and its transpose seven times. The first of equal energies, row by row of the window, has the gradient.
     """
 
     @staticmethod
     def forward(ctx: Any, gray: Tensor, matrix: Tensor) -> Tensor:
         side = math.isqrt(matrix.shape[1])
-        patches = gray.unfold(0, side, STRIDE).unfold(1, side, STRIDE)
+        patches = gray.unfold(0, side, WINDOW).unfold(1, side, WINDOW)
         rows, columns = patches.shape[:2]
         responses = (matrix @ patches.reshape(-1, side**2).T).view(2, ORIENTATIONS, -1, rows * columns)
         squares = responses[0].square().addcmul_(responses[1], responses[1])
@@ -130,4 +129,4 @@ class _GreatestSquares(torch.autograd.Function):
         places = len(matrix) // (2 * ORIENTATIONS)
         pulls = pull.new_zeros((2, ORIENTATIONS, places, pull.shape[-1])).scatter_(2, place, pull)
         patches = matrix.T @ pulls.view(len(matrix), -1)
-        return F.fold(patches, ctx.size, math.isqrt(matrix.shape[1]), stride=STRIDE)[0], None
+        return F.fold(patches, ctx.size, math.isqrt(matrix.shape[1]), stride=WINDOW)[0], None

@@ -19,10 +19,9 @@ PADDED = tl.constexpr(triton.next_power_of_2(gabor.ORIENTATIONS))
 SIZE = tl.constexpr(gabor.SIZE)
 TAPS = tl.constexpr(gabor.SIZE**2)
 WINDOW = tl.constexpr(gabor.WINDOW)
-STRIDE = tl.constexpr(gabor.STRIDE)
 SPACING = tl.constexpr(gabor.SPACING)
 LEAST = tl.constexpr(gabor.window_reach())  # pixels a side that the filters of a window lie in
-REACH = tl.constexpr((gabor.window_reach() - 1) // gabor.STRIDE + 1)  # windows, across, that see a pixel
+REACH = tl.constexpr((gabor.window_reach() - 1) // gabor.WINDOW + 1)  # windows, across, that see a pixel
 FAINT = tl.constexpr(gabor.FAINT)
 TINY = tl.constexpr(gabor.TINY)
 RED, GREEN, BLUE = (tl.constexpr(part / 2) for part in gabor.LUMA)
@@ -31,7 +30,7 @@ RED, GREEN, BLUE = (tl.constexpr(part / 2) for part in gabor.LUMA)
 @triton.jit
 def windows_along(pixels):
     """Windows along a side of so many pixels, which one fits into."""
-    return (pixels - LEAST) // STRIDE + 1
+    return (pixels - LEAST) // WINDOW + 1
 
 
 @triton.jit
@@ -173,29 +172,25 @@ def distances(
 
     grays: [2,PIXELS] float32. filters: [2,ORIENTATIONS,SIZE,SIZE] float32. squares: [2,ORIENTATIONS,PIXELS] float32, of
     `energies`. Written: sums [number of programs] float32, whose total is the loss; places [ORIENTATIONS,WINDOWS]
-    int32, where in the window, counted row by row, the render's energy is greatest, of such places the first of the
-    first block of STRIDE x STRIDE; pulls [2,ORIENTATIONS,WINDOWS] float32, the loss's gradient of the responses there
-    to the even and the odd filter.
+    int32, where in the window, counted row by row, the render's energy is greatest, of such places the first; pulls
+    [2,ORIENTATIONS,WINDOWS] float32, the loss's gradient of the responses there to the even and the odd filter.
     """
     window = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     octave, column, row = place_of_window(window, HEIGHT, WIDTH, OCTAVES)
     width = WIDTH >> octave
-    corner = pixels_before(octave, HEIGHT, WIDTH, OCTAVES) + (row * width + column) * STRIDE
+    corner = pixels_before(octave, HEIGHT, WIDTH, OCTAVES) + (row * width + column) * WINDOW
     orientation = tl.arange(0, PADDED)[:, None]
     there = orientation < ORIENTATIONS
     live = there & (window < WINDOWS)[None, :]
     best, theirs = tl.zeros((PADDED, BLOCK), tl.float32) - 1.0, tl.zeros((PADDED, BLOCK), tl.float32)
     place = tl.zeros((PADDED, BLOCK), tl.int32)
-    for top in range(0, WINDOW, STRIDE):
-        for left in range(0, WINDOW, STRIDE):
-            for below in range(0, STRIDE, SPACING):
-                for beside in tl.static_range(0, STRIDE, SPACING):
-                    down, right = top + below, left + beside
-                    at = squares + orientation * PIXELS + (corner + down * width + right)[None, :]
-                    value = tl.load(at, mask=live, other=0.0)
-                    place = tl.where(value > best, down * WINDOW + right, place)
-                    best = tl.maximum(best, value)
-                    theirs = tl.maximum(theirs, tl.load(at + ORIENTATIONS * PIXELS, mask=live, other=0.0))
+    for down in range(0, WINDOW, SPACING):
+        for right in tl.static_range(0, WINDOW, SPACING):
+            at = squares + orientation * PIXELS + (corner + down * width + right)[None, :]
+            value = tl.load(at, mask=live, other=0.0)
+            place = tl.where(value > best, down * WINDOW + right, place)
+            best = tl.maximum(best, value)
+            theirs = tl.maximum(theirs, tl.load(at + ORIENTATIONS * PIXELS, mask=live, other=0.0))
     even, odd = tl.zeros((PADDED, BLOCK), tl.float32), tl.zeros((PADDED, BLOCK), tl.float32)
     at = grays + corner[None, :] + place // WINDOW * width[None, :] + place % WINDOW
     for down in range(SIZE):
@@ -247,13 +242,13 @@ def energies_backward(
     total = tl.zeros((PADDED, BLOCK), tl.float32)
     for above in range(REACH):
         for left in range(REACH):
-            row, column = y // STRIDE - above, x // STRIDE - left
+            row, column = y // WINDOW - above, x // WINDOW - left
             inside = live & (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
             seen = there & inside[None, :]
             at = orientation * WINDOWS + (first + row * columns + column)[None, :]
             place = tl.load(places + at, mask=seen, other=0)
-            down = (y - row * STRIDE)[None, :] - place // WINDOW
-            right = (x - column * STRIDE)[None, :] - place % WINDOW
+            down = (y - row * WINDOW)[None, :] - place // WINDOW
+            right = (x - column * WINDOW)[None, :] - place % WINDOW
             seen = seen & (down >= 0) & (down < SIZE) & (right >= 0) & (right < SIZE)
             tap = filters + orientation * TAPS + down * SIZE + right
             even = tl.load(tap, mask=seen, other=0.0)

@@ -75,7 +75,7 @@ def gabor_loss(render: Tensor, photograph: Tensor, foreground: Tensor, filters: 
 
 def _windows(side: tuple[int, int]) -> int:
     """Of an octave of so many pixels a side."""
-    high, wide = ((pixels - gabor.window_reach()) // gabor.STRIDE + 1 for pixels in side)
+    high, wide = ((pixels - gabor.window_reach()) // gabor.WINDOW + 1 for pixels in side)
     return high * wide
 
 

@@ -75,6 +75,7 @@ COMPARED_SCORES = {
 """Of real scans, and of all of them together; corrected: with pose and tone of the held-out views put right."""
 SCAN_SCORES = {
     **COMPARED_SCORES,
+    "motion_cost": "of it motion of the photographs",
     "lpips_full": "full image",
     "band_error": "band error",
     "s3_ratio": "S3 ratio",
@@ -247,7 +248,8 @@ class Results:
     def add(
         self, settings: Mapping[str, Any], scores: Mapping[str, float], seconds: float, gpu: str | None = None
     ) -> None:
-        """Keeps a cell and writes the file, so that a stop loses no more than the cell in the making.
+        """Keeps a cell, in place of one with the same settings, and writes the file, so that a stop loses no more than
+        the cell in the making.
 
         gpu: the name of the one that it was run on.
         """
@@ -257,7 +259,8 @@ class Results:
         folder = os.open(self.path.parent, os.O_RDONLY)
         try:
             fcntl.flock(folder, fcntl.LOCK_EX)
-            self.cells = [*self._read(), {"settings": dict(settings), "scores": dict(scores), **made}]
+            others = [cell for cell in self._read() if cell["settings"] != settings]
+            self.cells = [*others, {"settings": dict(settings), "scores": dict(scores), **made}]
             write_atomically(self.path, json.dumps({"cells": self.cells}, indent=1).encode() + b"\n")
         finally:
             os.close(folder)

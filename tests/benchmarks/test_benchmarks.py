@@ -101,6 +101,8 @@ def test_results_survive_and_cells_are_found_by_all_their_settings(tmp_path: Pat
     assert found["scores"] == {"lpips": 0.7}
     assert again.find({"method": "mean"}) is None
     assert harness.mean_of(again.cells, "lpips") == pytest.approx(0.6)
+    again.add({"level": 2.0, "method": "mean"}, {"lpips": 0.3}, 2.0)
+    assert harness.mean_of(again.cells, "lpips") == pytest.approx(0.4), "a cell that is made anew takes the place"
 
 
 def test_a_page_says_when_and_how_it_was_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -324,7 +326,9 @@ def test_methods_are_compared_on_a_scan(
         ("view_selection", 2.0),
     }
     for cell in found:
-        assert {"lpips", "lpips_corrected", "displacement_cost", "displacement_pixels"} <= set(cell["scores"])
+        assert {"lpips", "lpips_corrected", "displacement_cost", "displacement_pixels", "motion_cost"} <= set(
+            cell["scores"]
+        )
     page = (tmp_path / "out" / "scans.md").read_text()
     assert "| method | LPIPS | corrected LPIPS | of it displacement | displacement, pixels |" in page
     assert all(f"| {method} |" in page for method in ("mean", "view_selection"))

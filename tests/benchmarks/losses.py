@@ -63,7 +63,6 @@ Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
 VARIANTS: dict[str, dict[str, Any]] = {
     "gabor": {},
     "no maximum": {"WINDOW": 1},
-    "windows of 2": {"WINDOW": 2},
     "windows of 8": {"WINDOW": 8},
     "faint 0.05": {"FAINT": 0.05},
     "faint 0.1": {"FAINT": 0.1},

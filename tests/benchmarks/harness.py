@@ -56,6 +56,8 @@ from advtex_options.methods import known_methods
 
 RESULTS = Path(__file__).parent / "results"
 SHOWN_VIEW = 4  # of the held-out ones
+OWN_STEPS = ("l1", "view_selection")
+"""Methods that take as many steps here as in everybody's runs: until they have settled, passes over all views."""
 SCORES = {
     "lpips": "LPIPS",
     "nearest_patch": "nearest patch",
@@ -383,7 +385,9 @@ def common_arguments(name: str, description: str | None) -> argparse.ArgumentPar
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--views", type=int, default=60)
     parser.add_argument("--size", default="320x240", help="WIDTHxHEIGHT of the views")
-    parser.add_argument("--steps", type=int, default=1000, help="of the methods that take steps, but for l1")
+    parser.add_argument(
+        "--steps", type=int, default=1000, help=f"of methods that take steps, but {' and '.join(OWN_STEPS)}"
+    )
     parser.add_argument("--preset", default="standard")
     parser.add_argument("--faces", type=int, default=20_000)
     parser.add_argument("--device", default="auto")
@@ -394,15 +398,20 @@ def common_arguments(name: str, description: str | None) -> argparse.ArgumentPar
 
 
 def configuration(arguments: argparse.Namespace, method: str) -> TextureConfig:
-    """The common options as the engine takes them; `l1` is run until it has settled."""
+    """The common options as the engine takes them."""
     return TextureConfig(
         preset=arguments.preset,
         method=method,
-        steps=None if method == "l1" else arguments.steps,
+        steps=steps_of(method, arguments.steps),
         face_budget=arguments.faces,
         refine=arguments.refine,
         device=arguments.device,
     )
+
+
+def steps_of(method: str, asked: int | None) -> int | None:
+    """asked; None, as many as the method itself takes, for those of OWN_STEPS."""
+    return None if method in OWN_STEPS else asked
 
 
 def parsed_size(text: str) -> tuple[int, int]:

@@ -41,6 +41,7 @@ from harness import (
     score_model,
     score_texture,
     shown_mean,
+    steps_of,
     write_report,
 )
 from study import SCANS, make_named_scan
@@ -195,7 +196,8 @@ def textures(
     inputs: dict[object, tuple[MethodInput, float]] = {}
     for name in variants:
         variant = VARIANTS[name]
-        changed = dataclasses.replace(config, method=variant.method, refine=variant.refine)
+        steps = steps_of(variant.method, config.steps)
+        changed = dataclasses.replace(config, method=variant.method, refine=variant.refine, steps=steps)
         shared = (variant.refine, *variant.prepared.items())
         if shared not in inputs:
             watch = Stopwatch()

@@ -28,10 +28,11 @@ from advtex_engine.metrics.budget import (
     own_motion,
     warped,
 )
-from advtex_engine.metrics.evaluate import Scores, compare, view_budget
+from advtex_engine.metrics.evaluate import DEPTH_AGREEMENT, Scores, compare, view_budget
 from advtex_engine.metrics.lpips import Lpips
 from advtex_engine.metrics.photograph import Photograph
 from advtex_engine.refine.pose import exponential
+from advtex_engine.render.rasterize import rasterize
 from advtex_engine.render.render_view import render_view
 from advtex_engine.results.export import export_model
 
@@ -44,8 +45,8 @@ def lpips() -> Lpips:
     return random_lpips()
 
 
-def relief() -> Atlas:
-    mesh = sheet(4.0, 40, (0.15, 3.0, 2.0, 0.0))
+def relief(cells: int = 40) -> Atlas:
+    mesh = sheet(4.0, cells, (0.15, 3.0, 2.0, 0.0))
     return Atlas(mesh, TEXELS, TEXELS, "scan", 1)
 
 
@@ -169,13 +170,17 @@ def test_a_motion_s_blur_keeps_what_is_even_and_what_is_not_known(photo: Tensor)
     assert torch.allclose(along_motion(even, mask, 7.0, 0.6), even, atol=1e-6)
 
 
-def test_what_a_wrong_pose_costs_is_pose(photo: Tensor, lpips: Lpips) -> None:
+def wrongly_posed(photo: Tensor) -> View:
     """Turned and moved by some pixels."""
     motion = exponential(torch.tensor([[0.006, -0.008, 0.004, 0.01, 0.008, -0.01]], dtype=torch.float64))[0]
     wrong = replace(CAMERA, world_to_camera=motion @ CAMERA.world_to_camera)
-    color = (photo * 255).round().to(torch.uint8)
+    return View("view", wrong, (photo * 255).round().to(torch.uint8), mask=region())
+
+
+def test_what_a_wrong_pose_costs_is_pose(photo: Tensor, lpips: Lpips) -> None:
     atlas, texture = relief(), painted()
-    view = View("view", wrong, color, mask=region())
+    view = wrongly_posed(photo)
+    color = view.color
     given = compare(atlas, texture, view)
     assert given is not None
     scores = view_budget(atlas, texture, view, given, atlas.mesh, "scene", lpips)
@@ -191,6 +196,39 @@ def test_what_a_wrong_pose_costs_is_pose(photo: Tensor, lpips: Lpips) -> None:
     again = compare(atlas, texture, other)
     assert again is not None
     assert view_budget(atlas, texture, other, again, atlas.mesh, "scene", None)["pose_pixels"] == scores["pose_pixels"]
+
+
+def test_the_right_pose_is_seen_where_the_device_s_depth_fits_the_wrong_one_alone(photo: Tensor, lpips: Lpips) -> None:
+    """In half of the view: depths that agree by a hair from where the camera was said to be."""
+    atlas, texture, view = relief(), painted(), wrongly_posed(photo)
+    right, wrong = (rasterize(atlas.mesh, camera).depth for camera in (CAMERA, view.camera))
+    half = (torch.arange(WIDTH) > WIDTH // 2).expand(HEIGHT, -1)
+    depth = torch.where(half, wrong - DEPTH_AGREEMENT + 1e-4, right)
+    view = replace(view, depth=depth)
+    given = compare(atlas, texture, view)
+    assert given is not None
+    assert float(((depth - right)[given.mask] < -DEPTH_AGREEMENT).float().mean()) > 0.3
+    assert share(view_budget(atlas, texture, view, given, atlas.mesh, "scene", lpips), "pose_cost") > 0.99
+
+
+def test_no_pose_excuses_what_the_model_leaves_out(photo: Tensor, lpips: Lpips) -> None:
+    """Slits that are as wide as the camera is off, so that what one pose leaves out, the other shows."""
+    whole, texture = relief(160), painted()
+    middles = whole.mesh.v_pos[whole.mesh.t_pos_idx.long()].mean(1)
+    kept = (middles[:, 0] * 40).floor() % 16 != 0
+    mesh = replace(
+        whole.mesh,
+        t_pos_idx=whole.mesh.t_pos_idx[kept],
+        t_uv_idx=whole.mesh.t_uv_idx[kept],  # type: ignore[index]
+    )
+    slit = replace(whole, mesh=mesh)
+    view = wrongly_posed(photo)
+    given, right = (compare(slit, texture, replace(view, camera=c), whole.mesh) for c in (view.camera, CAMERA))
+    assert given is not None
+    assert right is not None
+    left_out = lpips.masked(right.image, Photograph(right.photo, right.mask))
+    scores = view_budget(slit, texture, view, given, whole.mesh, "scene", lpips)
+    assert scores["lpips_corrected"] == pytest.approx(left_out, rel=0.1)
 
 
 def test_all_costs_sum_to_the_raw_figure(photo: Tensor, lpips: Lpips) -> None:

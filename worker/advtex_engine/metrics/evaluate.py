@@ -149,18 +149,19 @@ def view_budget(
 ) -> Scores:
     """`budget_scores` of a view, and by how many pixels its camera was moved.
 
-    given: its comparison at the given pose, whose pixels count all along. What the refined camera does not show of them
-    stays as the given one shows it.
+    given: its comparison at the given pose, whose pixels count all along; which of them the model leaves out, the
+    refined camera decides. Pixels that it does not look at stay as the given one shows them.
     """
     color = torch.from_numpy(fill_masked(view.color.numpy(), given.mask.numpy()))
     masked = replace(view, color=color, mask=given.mask)
     # A pixel's motion, which LPIPS sees, is hardly significant; where the better guess is the worse pose, that shows.
     (moved,), (report,) = refine_heldout(atlas, texture, [masked], kind, standard_errors=0.0)
-    shown = None if report["kept_pose"] else compare(atlas, texture, replace(view, camera=moved.camera), reference)
+    looked = None if report["kept_pose"] else _look(atlas, replace(view, camera=moved.camera), reference)
     posed, known = given.image, given.covered
-    if shown is not None:
-        new = given.mask & shown.covered
-        posed, known = torch.where(new[..., None], shown.image, posed), known | new
+    if looked is not None:
+        shown, left_out = given.mask & looked.near, given.mask & looked.mask & ~looked.covered
+        posed = torch.where(shown[..., None], looked.render(texture), posed) * ~left_out[..., None]
+        known = (known | shown) & ~left_out
     scores = budget_scores(given.photo, given.image, posed, given.mask, known, lpips)
     return {**scores, "pose_pixels": report["moved_pixels"]}
 
@@ -185,21 +186,28 @@ def compare(atlas: Atlas, texture: Tensor, view: View, reference: Mesh | None = 
 
 @dataclass(frozen=True)
 class _Looked:
-    """A view of a model, whatever its texture. mask, covered: those of `Comparison`."""
+    """A view of a model, whatever its texture. mask: that of `Comparison`; near: [H,W] bool, where the model is at the
+    reference's depth, whether that counts or not."""
 
     view: View
     mask: Tensor
-    covered: Tensor
+    near: Tensor
     buffer: GBuffer
 
     @cached_property
     def photo(self) -> Tensor:
         return self.view.color.to(torch.float32) / 255
 
-    def shows(self, texture: Tensor) -> Comparison:
+    @property
+    def covered(self) -> Tensor:
+        return self.mask & self.near
+
+    def render(self, texture: Tensor) -> Tensor:
         color, cover = shade_layers(self.buffer, texture)
-        color = color / cover.clamp(min=1e-6)[..., None]
-        image = torch.where(self.mask[..., None], color * self.covered[..., None], self.photo)
+        return color / cover.clamp(min=1e-6)[..., None]
+
+    def shows(self, texture: Tensor) -> Comparison:
+        image = torch.where(self.mask[..., None], self.render(texture) * self.covered[..., None], self.photo)
         return Comparison(self.view.name, self.photo, image, self.mask, self.covered)
 
 
@@ -214,8 +222,9 @@ def _look(atlas: Atlas, view: View, reference: Mesh | None = None) -> _Looked | 
         mask = mask & view.mask
     if int(mask.sum()) < MIN_PIXELS:
         return None
-    covered = mask & (fragments.face_index >= 0) & ((fragments.depth - target.depth).abs() < DEPTH_AGREEMENT)
-    return _Looked(view, mask, covered, gbuffer(atlas, view.camera, _supersample(atlas, fragments)))
+    near = (fragments.face_index >= 0) & ((fragments.depth - target.depth).abs() < DEPTH_AGREEMENT)
+    near = near & (target.face_index >= 0)
+    return _Looked(view, mask, near, gbuffer(atlas, view.camera, _supersample(atlas, fragments)))
 
 
 def score(

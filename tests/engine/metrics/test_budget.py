@@ -45,8 +45,8 @@ def lpips() -> Lpips:
     return random_lpips()
 
 
-def relief(cells: int = 40) -> Atlas:
-    mesh = sheet(4.0, cells, (0.15, 3.0, 2.0, 0.0))
+def relief(cells: int = 40, size: float = 4.0) -> Atlas:
+    mesh = sheet(size, cells, (0.15, 3.0, 2.0, 0.0))
     return Atlas(mesh, TEXELS, TEXELS, "scan", 1)
 
 
@@ -209,6 +209,19 @@ def test_the_right_pose_is_seen_where_the_device_s_depth_fits_the_wrong_one_alon
     assert given is not None
     assert float(((depth - right)[given.mask] < -DEPTH_AGREEMENT).float().mean()) > 0.3
     assert share(view_budget(atlas, texture, view, given, atlas.mesh, "scene", lpips), "pose_cost") > 0.99
+
+
+def test_pixels_that_count_by_the_wrong_pose_alone_cost_pose(lpips: Lpips) -> None:
+    """Beside the mesh's border, where the photograph shows what nobody scanned."""
+    atlas, texture = relief(size=1.6), painted()
+    beyond = torch.rand((HEIGHT, WIDTH, 3), generator=torch.Generator().manual_seed(5))
+    there = rasterize(atlas.mesh, CAMERA).face_index >= 0
+    assert 0.2 < float(there.float().mean()) < 0.8
+    view = replace(wrongly_posed(torch.where(there[..., None], render_view(atlas, texture, CAMERA), beyond)), mask=None)
+    given = compare(atlas, texture, view)
+    assert given is not None
+    assert int((given.mask & ~there).sum()) > 500
+    assert share(view_budget(atlas, texture, view, given, atlas.mesh, "scene", lpips), "pose_cost") > 0.97
 
 
 def test_no_pose_excuses_what_the_model_leaves_out(photo: Tensor, lpips: Lpips) -> None:

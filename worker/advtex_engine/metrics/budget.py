@@ -5,6 +5,7 @@ One thing after the other is put right in the render, in this order, and LPIPS o
 1. pose: the view's camera is refined against the model (`refine_heldout`) and the model rendered anew. That comes first
    since it looks at local contrast, which no tone changes, while tones fitted to a displaced render are too faint. Six
    degrees of freedom know of parallax, and rendering resamples nothing, where a homography fits planes and blurs.
+   Pixels that count by the wrong pose alone go with it; what the model leaves out at the right one stays black.
 2. tone: a robust gain and offset per channel (exposure, white balance), then wide averages (vignetting, light that
    depends on the view), both from pixels that are clipped in neither image.
 3. displacement: a dense flow moves the render onto the photograph. It is smooth, so it cannot copy detail, and pixels

@@ -149,19 +149,19 @@ def view_budget(
 ) -> Scores:
     """`budget_scores` of a view, and by how many pixels its camera was moved.
 
-    given: its comparison at the given pose, whose pixels count all along; which of them the model leaves out, the
-    refined camera decides. Pixels that it does not look at stay as the given one shows them.
+    given: its comparison at the given pose, whose pixels count all along. Those that the refined camera does not find on
+    the reference count by the pose's fault alone and hold the photograph from then on, where the model is left out or
+    not. Depths that just agree must not all leave when the camera moves by a pixel: they may be twice as far off then.
     """
     color = torch.from_numpy(fill_masked(view.color.numpy(), given.mask.numpy()))
     masked = replace(view, color=color, mask=given.mask)
     # A pixel's motion, which LPIPS sees, is hardly significant; where the better guess is the worse pose, that shows.
     (moved,), (report,) = refine_heldout(atlas, texture, [masked], kind, standard_errors=0.0)
-    looked = None if report["kept_pose"] else _look(atlas, replace(view, camera=moved.camera), reference)
-    posed, known = given.image, given.covered
-    if looked is not None:
-        shown, left_out = given.mask & looked.near, given.mask & looked.mask & ~looked.covered
-        posed = torch.where(shown[..., None], looked.render(texture), posed) * ~left_out[..., None]
-        known = (known | shown) & ~left_out
+    shown = None
+    if not report["kept_pose"]:
+        right = replace(view, camera=moved.camera, mask=given.mask)
+        shown = compare(atlas, texture, right, reference, 2 * DEPTH_AGREEMENT)
+    posed, known = (given.image, given.covered) if shown is None else (shown.image, shown.covered)
     scores = budget_scores(given.photo, given.image, posed, given.mask, known, lpips)
     return {**scores, "pose_pixels": report["moved_pixels"]}
 
@@ -174,57 +174,53 @@ def configured_lpips(folder: Path | None = None) -> tuple[Lpips | None, dict[str
         return None, {name: str(error) for name in ("lpips", "lpips_full")}
 
 
-def compare(atlas: Atlas, texture: Tensor, view: View, reference: Mesh | None = None) -> Comparison | None:
+def compare(
+    atlas: Atlas, texture: Tensor, view: View, reference: Mesh | None = None, tolerance: float = DEPTH_AGREEMENT
+) -> Comparison | None:
     """The model at the view's camera, beside the photograph; None when fewer than MIN_PIXELS count.
 
     texture: [atlas.height,atlas.width,3] uint8 sRGB or float in [0,1]. reference: the mesh that decides which pixels
-    count, by default the model's own.
+    count, by default the model's own. tolerance: metres between its depth and the device's.
     """
-    looked = _look(atlas, view, reference)
+    looked = _look(atlas, view, reference, tolerance)
     return None if looked is None else looked.shows(texture)
 
 
 @dataclass(frozen=True)
 class _Looked:
-    """A view of a model, whatever its texture. mask: that of `Comparison`; near: [H,W] bool, where the model is at the
-    reference's depth, whether that counts or not."""
+    """A view of a model, whatever its texture. mask, covered: those of `Comparison`."""
 
     view: View
     mask: Tensor
-    near: Tensor
+    covered: Tensor
     buffer: GBuffer
 
     @cached_property
     def photo(self) -> Tensor:
         return self.view.color.to(torch.float32) / 255
 
-    @property
-    def covered(self) -> Tensor:
-        return self.mask & self.near
-
-    def render(self, texture: Tensor) -> Tensor:
-        color, cover = shade_layers(self.buffer, texture)
-        return color / cover.clamp(min=1e-6)[..., None]
-
     def shows(self, texture: Tensor) -> Comparison:
-        image = torch.where(self.mask[..., None], self.render(texture) * self.covered[..., None], self.photo)
+        color, cover = shade_layers(self.buffer, texture)
+        color = color / cover.clamp(min=1e-6)[..., None]
+        image = torch.where(self.mask[..., None], color * self.covered[..., None], self.photo)
         return Comparison(self.view.name, self.photo, image, self.mask, self.covered)
 
 
-def _look(atlas: Atlas, view: View, reference: Mesh | None = None) -> _Looked | None:
-    """None when fewer than MIN_PIXELS count; reference: as for `compare`."""
+def _look(
+    atlas: Atlas, view: View, reference: Mesh | None = None, tolerance: float = DEPTH_AGREEMENT
+) -> _Looked | None:
+    """None when fewer than MIN_PIXELS count; reference, tolerance: as for `compare`."""
     fragments = rasterize(atlas.mesh, view.camera)
     target = fragments if reference is None else rasterize(reference, view.camera)
     mask = target.face_index >= 0
     if view.depth is not None:
-        mask = mask & (view.depth > 0) & ((view.depth - target.depth).abs() < DEPTH_AGREEMENT)
+        mask = mask & (view.depth > 0) & ((view.depth - target.depth).abs() < tolerance)
     if view.mask is not None:
         mask = mask & view.mask
     if int(mask.sum()) < MIN_PIXELS:
         return None
-    near = (fragments.face_index >= 0) & ((fragments.depth - target.depth).abs() < DEPTH_AGREEMENT)
-    near = near & (target.face_index >= 0)
-    return _Looked(view, mask, near, gbuffer(atlas, view.camera, _supersample(atlas, fragments)))
+    covered = mask & (fragments.face_index >= 0) & ((fragments.depth - target.depth).abs() < DEPTH_AGREEMENT)
+    return _Looked(view, mask, covered, gbuffer(atlas, view.camera, _supersample(atlas, fragments)))
 
 
 def score(

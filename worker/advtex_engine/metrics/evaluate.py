@@ -149,9 +149,9 @@ def view_budget(
 ) -> Scores:
     """`budget_scores` of a view, and by how many pixels its camera was moved.
 
-    given: its comparison at the given pose, whose pixels count all along. Those that the refined camera does not find on
-    the reference count by the pose's fault alone and hold the photograph from then on, where the model is left out or
-    not. Depths that just agree must not all leave when the camera moves by a pixel: they may be twice as far off then.
+    given: its comparison at the given pose, whose pixels count all along. Those at which the refined camera does not
+    find the reference count by the pose's fault alone, and hold the photograph from then on. Not so those at which the
+    device's depth just agreed, of which a camera that moves by a pixel loses many: it may be twice as far off then.
     """
     color = torch.from_numpy(fill_masked(view.color.numpy(), given.mask.numpy()))
     masked = replace(view, color=color, mask=given.mask)

@@ -224,6 +224,24 @@ def test_pixels_that_count_by_the_wrong_pose_alone_cost_pose(lpips: Lpips) -> No
     assert share(view_budget(atlas, texture, view, given, atlas.mesh, "scene", lpips), "pose_cost") > 0.97
 
 
+def test_a_camera_that_loses_the_scene_is_not_taken(
+    photo: Tensor, lpips: Lpips, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As one does that is refined against a texture that shows something else."""
+    atlas, texture, view = relief(), painted().roll(200, 1), wrongly_posed(photo)
+    half = (torch.arange(WIDTH) > WIDTH // 2).expand(HEIGHT, -1)
+    view = replace(view, depth=rasterize(atlas.mesh, CAMERA).depth + torch.where(half, -0.03, 0.03))
+    given = compare(atlas, texture, view)
+    assert given is not None
+    pose = CAMERA.world_to_camera.clone()
+    pose[2, 3] += 0.08  # metres, away from the sheet: half of the depths are .11 off then
+    away = replace(view, camera=replace(view.camera, world_to_camera=pose))
+    refined = (away,), [{"kept_pose": False, "moved_pixels": 9.0}]
+    monkeypatch.setattr("advtex_engine.metrics.evaluate.refine_heldout", lambda *_, **__: refined)
+    scores = view_budget(atlas, texture, view, given, atlas.mesh, "scene", lpips)
+    assert (scores["pose_cost"], scores["pose_pixels"]) == (0.0, 0.0)
+
+
 def test_no_pose_excuses_what_the_model_leaves_out(photo: Tensor, lpips: Lpips) -> None:
     """Slits that are as wide as the camera is off, so that what one pose leaves out, the other shows."""
     whole, texture = relief(160), painted()

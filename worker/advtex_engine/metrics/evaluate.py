@@ -39,6 +39,9 @@ from advtex_engine.runtime.threads import in_threads, one_thread_each
 
 DEPTH_AGREEMENT = 0.05
 """Metres between the depths of device, scan's mesh and model."""
+LEFT_BEHIND = 0.2
+"""Of a view's pixels, the most that a refined camera may not find on the reference. Of views of five scans up to .12
+are left behind; of a texture that shows something else .2 to .65, since any pose is as good as another."""
 MIN_PIXELS = 500
 """Views in which fewer pixels count are left out."""
 PATCH_QUERIES = 1000
@@ -151,7 +154,8 @@ def view_budget(
 
     given: its comparison at the given pose, whose pixels count all along. Those at which the refined camera does not
     find the reference count by the pose's fault alone, and hold the photograph from then on. Not so those at which the
-    device's depth just agreed, of which a camera that moves by a pixel loses many: it may be twice as far off then.
+    device's depth just agreed, of which a camera that moves by a pixel loses many: it may be twice as far off then. A
+    camera that leaves LEFT_BEHIND of them is not the photograph's, and the given one stays.
     """
     color = torch.from_numpy(fill_masked(view.color.numpy(), given.mask.numpy()))
     masked = replace(view, color=color, mask=given.mask)
@@ -161,9 +165,12 @@ def view_budget(
     if not report["kept_pose"]:
         right = replace(view, camera=moved.camera, mask=given.mask)
         shown = compare(atlas, texture, right, reference, 2 * DEPTH_AGREEMENT)
-    posed, known = (given.image, given.covered) if shown is None else (shown.image, shown.covered)
+    if shown is None or shown.mask.sum() < (1 - LEFT_BEHIND) * given.mask.sum():
+        posed, known, pixels = given.image, given.covered, 0.0
+    else:
+        posed, known, pixels = shown.image, shown.covered, report["moved_pixels"]
     scores = budget_scores(given.photo, given.image, posed, given.mask, known, lpips)
-    return {**scores, "pose_pixels": report["moved_pixels"]}
+    return {**scores, "pose_pixels": pixels}
 
 
 def configured_lpips(folder: Path | None = None) -> tuple[Lpips | None, dict[str, str]]:

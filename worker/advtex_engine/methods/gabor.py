@@ -45,7 +45,7 @@ operations keep two threads busy for two thirds of the time."""
 BLOCK = 8  # pixels a side, of which means are compared; every half of it
 UNLIKE = 0.6
 """Of unrelated pictures' unlikeness, what the start has to photographs that it was not painted from where they have
-too little in common: .09 to .48 on scans that gain by the descent, .72 to .90 where it harms
+too little in common: .07 to .48 on scans that gain by the descent, .72 where it is level, .90 where it harms
 (`tests/benchmarks/agreement.py`)."""
 
 

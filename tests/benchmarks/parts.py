@@ -106,7 +106,8 @@ VARIANTS = {
     "no descent, without refined geometry": Variant("view_selection_no_descent", prepared={f"{REFINE}.run.ROUNDS": 0}),
     "no descent, without refinement": Variant("view_selection_no_descent", refine=False),
     "no descent, what is not measured is seen": Variant(
-        "view_selection_no_descent", prepared={"advtex_engine.render.view_maps.UNMEASURED": 0.0}
+        "view_selection_no_descent",
+        prepared={"advtex_engine.render.view_maps.UNMEASURED": 0.0, "advtex_engine.render.view_maps.ALWAYS_READ": 0.0},
     ),
     "view selection": Variant("view_selection"),
     "the whole": Variant(),

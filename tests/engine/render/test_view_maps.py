@@ -19,7 +19,7 @@ from advtex_engine.render import pairs, view_maps
 from advtex_engine.render.pairs import example_differences, overlaps, related_pairs
 from advtex_engine.render.reproject import reproject, unproject_pixels
 from advtex_engine.render.texture import decode_uv, touched_slots
-from advtex_engine.render.view_maps import UNMEASURED, ViewMaps, build_view_maps, contradicted
+from advtex_engine.render.view_maps import UNMEASURED, ViewMaps, always_read, build_view_maps, contradicted
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 
@@ -133,6 +133,50 @@ def test_a_reading_speaks_for_pixels_near_it_that_have_none_but_where_nothing_el
         foreground = maps.depth.view(maps.count, HEIGHT, WIDTH) > 0
         codes = maps.uv.view(maps.count, HEIGHT, WIDTH, 2)
         assert torch.equal(touched_slots(codes, foreground, 256, 256)[0], maps.slot_map)
+
+
+def test_no_reading_is_no_surface_where_depth_is_found_of_all_surfaces() -> None:
+    """The mesh goes on for a column beyond what was measured of a wall that ends in the middle."""
+    whole = scene_mesh()
+    assert whole.v_uv is not None
+    position, faces = whole.v_pos[:4].clone(), whole.t_pos_idx[:2]
+    position[1:3, 0] = 2 / FOCAL
+    atlas = Atlas(Mesh(position, faces, whole.v_uv[:4], faces), 2048, 2048, "scan", 1)
+    measured = torch.full((HEIGHT, WIDTH), 2.0)
+    measured[:, WIDTH // 2 :] = 0
+    beyond, columns = np.s_[10:-10, WIDTH // 2], np.s_[10:-10, WIDTH // 4 : WIDTH // 2]
+
+    def depth_of(*depths: torch.Tensor | None) -> torch.Tensor:
+        views = tuple(viewed(camera_at(0.0), depth) for depth in depths)
+        return build_view_maps(atlas, views, "object").depth[0].view(HEIGHT, WIDTH)
+
+    both = depth_of(measured, None)
+    assert (both[columns] > 0).all()
+    assert (both[beyond] == 0).all()
+    assert (depth_of(measured)[beyond] > 0).all(), "no other pixel shows it"
+    measured[20:24, 20:24] = 0  # where readings fail inside of surfaces, too, a lack of them tells nothing
+    failing = depth_of(measured, None)
+    assert (failing[columns] > 0).all()
+    assert (failing[beyond] > 0).all()
+
+
+@pytest.mark.parametrize(("lacking", "expected"), [(0, True), (1, True), (3, False), (2000, False)])
+def test_depth_is_always_read_if_hardly_any_pixel_inside_of_surfaces_lacks_a_reading(
+    lacking: int, expected: bool
+) -> None:
+    """A share of 1/1000 of some 2,500; outlines, what a mask leaves out and views without depth do not count."""
+    depth = maps_of([camera_at(0.0)]).depth[0].view(HEIGHT, WIDTH).float()
+    inside = (depth == 2).nonzero()
+    edge = (depth[:, 1:] != depth[:, :-1]).nonzero()
+    depth[tuple(edge.T)] = 0
+    rows, columns = inside[(inside[:, 1] < WIDTH // 4) | (inside[:, 1] >= 3 * WIDTH // 4)][:lacking].unbind(1)
+    depth[rows, columns] = 0
+    mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    mask[HEIGHT // 2 :, :5] = False
+    depth[~mask] = 0
+    views = [viewed(camera_at(0.0)), viewed(camera_at(0.0), depth, mask)]
+    assert always_read(scene_mesh(), views, 0.03) == expected
+    assert not always_read(scene_mesh(), views[:1], 0.03), "nothing was measured"
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.02, 0.5, 1.0]))

@@ -7,13 +7,14 @@ Views that do not fit on the device stay on the host, and go there one by one (`
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from advtex_engine.core.scene import Atlas, View
+from advtex_engine.core.scene import Atlas, Mesh, View
 from advtex_engine.render.filtering import window_sums
 from advtex_engine.render.prefetch import uploaded
 from advtex_engine.render.rasterize import rasterize_views
@@ -26,6 +27,9 @@ TOGETHER = 32  # views of the host that are on the device at once
 UNMEASURED = 1 / 50
 """Of an image's width: how far a reading speaks for pixels that have none. Depth cameras measure nothing beside what
 stands in front of something else, and depth that is seen from the color camera has gaps there."""
+ALWAYS_READ = 1 / 1000
+"""Of the pixels inside of surfaces, how many may lack a reading where depth is found of every surface within reach."""
+ASKED = 8  # views, of how often a reading lacks
 NEIGHBORS = 4  # texels: a surface counts as seen where one so near is, since views from afar skip some
 
 Allocate = Callable[[tuple[int, ...], torch.dtype], Tensor]
@@ -93,8 +97,8 @@ def build_view_maps(atlas: Atlas, views: tuple[View, ...], kind: str, allocate: 
     allocate: makes what color, uv and depth are kept in; by default on the mesh's device.
 
     Device depth masks what the mesh lacks: a pixel whose measured depth differs from the mesh's by more than theta_z
-    shows something else than the mesh. So do pixels near it that have no reading (`UNMEASURED`), but for those of a
-    surface that no other pixel shows.
+    shows something else than the mesh. So do pixels near it that have no reading (`UNMEASURED`), and all that have none
+    where that means that nothing is there (`always_read`), but for those of a surface that no other pixel shows.
     """
     assert views and all(
         (v.camera.width, v.camera.height) == (views[0].camera.width, views[0].camera.height) for v in views
@@ -109,6 +113,7 @@ def build_view_maps(atlas: Atlas, views: tuple[View, ...], kind: str, allocate: 
     depth = allocate((count, pixels), torch.float16)
     touched = torch.zeros((atlas.height, atlas.width), dtype=torch.bool, device=device)
     rasterized = rasterize_views(mesh, [view.camera for view in views])
+    nothing_there = always_read(mesh, views, tolerance)
     there = uploaded(views, device, with_color=color.device == device)
     for index, (view, fragments) in enumerate(zip(there, rasterized, strict=True)):
         hit = fragments.face_index >= 0
@@ -117,6 +122,8 @@ def build_view_maps(atlas: Atlas, views: tuple[View, ...], kind: str, allocate: 
         shown = fragments.depth
         if view.depth is not None:
             differs, doubtful = contradicted(view.depth, fragments.depth, tolerance)
+            if nothing_there:
+                doubtful = view.depth == 0
             hit = hit & ~differs
             shown = torch.where(doubtful, -shown, shown)
         corners = mesh.v_uv[mesh.t_uv_idx[fragments.face_index.clamp(min=0).long()]]
@@ -141,6 +148,35 @@ def build_view_maps(atlas: Atlas, views: tuple[View, ...], kind: str, allocate: 
         width=width,
         height=height,
     )
+
+
+def always_read(mesh: Mesh, views: Sequence[View], tolerance: float) -> bool:
+    """Whether the views' depth has a reading wherever it looks at the mesh, away from where that ends or jumps: as the
+    dense depth of phones has, and rendered one, of all that is near enough. What has none then shows what lies behind.
+
+    tolerance: metres between the nearest and farthest depth of what is no jump.
+    """
+    measured = [view for view in views if view.depth is not None]
+    asked = measured[:: -(-len(measured) // ASKED) or 1]
+    inside, lacking = 0, 0
+    for view, fragments in zip(asked, rasterize_views(mesh, [view.camera for view in asked]), strict=True):
+        assert view.depth is not None
+        rendered = torch.where(fragments.face_index >= 0, fragments.depth, 0.0)
+        reach = round(UNMEASURED * rendered.shape[1])
+        nearest, farthest = -_most(-rendered, reach), _most(rendered, reach)
+        surface = (nearest > 0) & (farthest - nearest < tolerance)
+        if view.mask is not None:
+            surface = surface & view.mask.to(surface.device)
+        inside += int(surface.sum())
+        lacking += int((surface & (view.depth == 0).to(surface.device)).sum())
+    return lacking < ALWAYS_READ * inside
+
+
+def _most(values: Tensor, reach: int) -> Tensor:
+    """[H,W]: the greatest of values [H,W] within so many rows and columns."""
+    side = 2 * reach + 1
+    rows = F.max_pool2d(values[None, None], (side, 1), stride=1, padding=(reach, 0))
+    return F.max_pool2d(rows, (1, side), stride=1, padding=(0, reach))[0, 0]
 
 
 def contradicted(measured: Tensor, rendered: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:

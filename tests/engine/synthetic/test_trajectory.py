@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cache
 
 import numpy as np
 import pytest
 import torch
 
 from advtex_engine.core.scene import Camera
+from advtex_engine.synthetic import object as synthetic_object
 from advtex_engine.synthetic import room, trajectory
 from advtex_engine.synthetic.camera import SHUTTER, Exposure, blur_pixels
 from advtex_engine.synthetic.real import FOCAL
-from advtex_engine.synthetic.trajectory import drift, moved, object_path, room_path, rotations
+from advtex_engine.synthetic.sensor import NEAREST
+from advtex_engine.synthetic.trajectory import drift, moved, object_path, object_widening, room_path, rotations
 
 TIMES = 18.0 * (np.arange(60) + 0.5) / 60
+
+
+@cache
+def still_life() -> np.ndarray:
+    """[N,3] metres; only its prints depend on the seed."""
+    return np.concatenate([patch.surface(patch.grid).reshape(-1, 3) for patch in synthetic_object.patches()]) / 1000
 
 
 @pytest.mark.parametrize("make", [room_path, object_path])
@@ -27,6 +36,16 @@ def test_a_path_is_rigid_and_smooth(make: object) -> None:
     assert speed.max() < 1.6
     assert np.abs(np.diff(speed)).max() < 0.4
     assert speed.mean() > 0.1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_camera_keeps_its_sensors_distance_from_all_of_an_object(seed: int) -> None:
+    nearest = NEAREST["structured"]
+    points = still_life()
+    for widening, kept in ((object_widening(nearest), True), (object_widening(0.0), False)):
+        path = object_path(np.random.default_rng([seed, 4]), widening)
+        places = path.poses(np.arange(0, path.duration, 1 / 30))[:, :3, 3]
+        assert (min(np.linalg.norm(points - place, axis=1).min() for place in places) > nearest) == kept
 
 
 @pytest.mark.parametrize("seed", range(5))

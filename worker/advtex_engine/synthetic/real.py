@@ -63,15 +63,15 @@ from advtex_engine.synthetic.files import (
     write_png,
 )
 from advtex_engine.synthetic.patches import GAMMA, Array, DrawnScene, Sky, assemble
-from advtex_engine.synthetic.sensor import DEPTH_SCALE, SensorName, depth_camera, look, measure, stored
+from advtex_engine.synthetic.sensor import DEPTH_SCALE, NEAREST, SensorName, depth_camera, look, measure, stored
 from advtex_engine.synthetic.trajectory import Path as CameraPath
-from advtex_engine.synthetic.trajectory import drift, moved, object_path, room_path
+from advtex_engine.synthetic.trajectory import drift, moved, object_path, object_widening, room_path
 
 SceneName = Literal["room", "object"]
 FOCAL = {"room": 0.86, "object": 1.05}
 """Focal length over the width of the image."""
 DISTANCE = {"room": 1.6, "object": 0.35}
-"""Metres from the camera to what it sees, about."""
+"""Metres from the camera to what it sees, about; to an object more, if the sensor needs it."""
 HELDOUT_VIEWS = 10
 HELDOUT_SUPERSAMPLE = 4
 HELDOUT_MOVE = 0.05
@@ -113,7 +113,7 @@ def synthesize_real(
     require_size(views, width, height)
     with new_scan(out) as folder, thread_per_view() as pool:
         drawn = drawn_scene(scene, seed)
-        recording = _record(drawn, scene, views, (width, height), seed, errors or Errors())
+        recording = _record(drawn, scene, sensor, views, (width, height), seed, errors or Errors())
         for name in ("color", "depth", "truth/heldout", "truth/depth"):
             (folder / name).mkdir(parents=True)
         taken = list(pool.map(lambda shot: _take(folder, drawn, recording, sensor, shot), recording.shots))
@@ -143,11 +143,19 @@ class Recording:
 
 
 def _record(
-    drawn: DrawnScene, scene: SceneName, views: int, size: tuple[int, int], seed: int, errors: Errors
+    drawn: DrawnScene,
+    scene: SceneName,
+    sensor: SensorName,
+    views: int,
+    size: tuple[int, int],
+    seed: int,
+    errors: Errors,
 ) -> Recording:
     """When and where every picture is taken. All that is random is drawn whatever the errors, so that they compare."""
     rng = np.random.default_rng([seed, 4])
-    path = room_path(rng) if scene == "room" else object_path(rng)
+    widening = 1.0 if scene == "room" else object_widening(NEAREST[sensor])
+    path = room_path(rng) if scene == "room" else object_path(rng, widening)
+    distance = widening * DISTANCE[scene]
     focal = FOCAL[scene] * size[0]
     K = torch.tensor([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]], dtype=torch.float64)
     camera = Camera(K, torch.eye(4, dtype=torch.float64), *size)
@@ -156,8 +164,8 @@ def _record(
     # Held-out views lie halfway between two frames.
     gaps = np.rint(np.linspace(0, views - 2, HELDOUT_VIEWS + 2)[1:-1])
     between = path.duration * (gaps + 1) / views
-    metres, radians = (part * errors.drift for part in drift(np.concatenate([times, between]), DISTANCE[scene], rng))
-    beside = rng.uniform(-1, 1, (HELDOUT_VIEWS, 3)) * HELDOUT_MOVE * DISTANCE[scene]
+    metres, radians = (part * errors.drift for part in drift(np.concatenate([times, between]), distance, rng))
+    beside = rng.uniform(-1, 1, (HELDOUT_VIEWS, 3)) * HELDOUT_MOVE * distance
     true = path.poses(np.concatenate([times, between]))
     true[views:, :3, 3] += beside
     tracked = moved(true, metres, radians)

@@ -42,7 +42,9 @@ WINDOW = 7
 """Pixels of a picture 640 wide: the side of the windows that are matched."""
 SHIFT_BIAS = 0.1
 """Pixels, root mean square: what calibration leaves, smooth over the picture and the same in every frame."""
-NEAREST, FARTHEST = 0.35, 4.5
+NEAREST: dict[SensorName, float] = {"structured": 0.35, "lidar": 0.0}
+"""Metres that a surface must be away."""
+FARTHEST = 4.5
 GRAZING = 0.17
 """Cosine: what is seen at a more grazing angle sends nothing back."""
 DARKEST = 0.004
@@ -116,7 +118,7 @@ def _structured(seen: Seen, camera: Camera, device: np.random.Generator, noise: 
     shift = shift + SHIFT_NOISE * _smooth(depth.shape, noise, window)
     shift = np.maximum(np.rint(shift / SHIFT_STEP) * SHIFT_STEP, SHIFT_STEP)
     measured = strength / shift
-    lost = ~np.isfinite(depth) | (measured < NEAREST) | (measured > FARTHEST) | _unanswered(seen)
+    lost = ~np.isfinite(depth) | (measured < NEAREST["structured"]) | (measured > FARTHEST) | _unanswered(seen)
     lost |= _shadow(near, camera)
     return np.asarray(np.where(lost, 0, measured), np.float32)
 

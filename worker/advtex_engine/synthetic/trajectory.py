@@ -53,7 +53,13 @@ ROOM_PATH: tuple[Waypoint, ...] = (
 OBJECT_RINGS = ((16.0, 0.36), (36.0, 0.40), (58.0, 0.38))
 """Elevation in degrees and distance in metres of the rings of a path around the object."""
 OBJECT_TARGET = (0.0, 0.0, 0.085)
+OBJECT_REACH = 0.173
+"""Metres from the target that the object reaches."""
 OBJECT_SECONDS = 18.0
+OBJECT_STEPS = 12
+"""Waypoints per turn around the object."""
+OBJECT_SPREAD = 0.15
+"""By what share at most the distance of a waypoint is more or less than its ring's."""
 
 
 @dataclass(frozen=True)
@@ -85,16 +91,24 @@ def room_path(rng: np.random.Generator) -> Path:
     return _path(seconds, places, targets, 1.0, rng)
 
 
-def object_path(rng: np.random.Generator) -> Path:
-    """Around the object in rings, one above the other."""
+def object_widening(nearest: float) -> float:
+    """By what factor the rings are wider for a sensor that measures nothing nearer than so many metres; 1 or more."""
+    # Between two waypoints a path is straight, and comes nearer.
+    least = min(distance for _, distance in OBJECT_RINGS) * (1 - OBJECT_SPREAD) * np.cos(np.pi / OBJECT_STEPS)
+    return float(max(1.0, (nearest + OBJECT_REACH) / least))
+
+
+def object_path(rng: np.random.Generator, widening: float = 1.0) -> Path:
+    """Around the object in rings, one above the other. widening: of `object_widening`."""
     turns = len(OBJECT_RINGS)
-    seconds = np.linspace(0, OBJECT_SECONDS, 12 * turns + 1)
+    seconds = np.linspace(0, OBJECT_SECONDS, OBJECT_STEPS * turns + 1)
     round_trip = np.linspace(0, turns, len(seconds))
     rings = np.array(OBJECT_RINGS)
     elevation, distance = (np.interp(round_trip, np.arange(turns) + 0.5, values) for values in rings.T)
     angle, lift = 2 * np.pi * round_trip, np.radians(elevation)
     towards = np.stack([np.cos(angle) * np.cos(lift), np.sin(angle) * np.cos(lift), np.sin(lift)], -1)
-    away = distance[:, None] * rng.uniform(0.85, 1.15, (len(seconds), 1))
+    spread = rng.uniform(1 - OBJECT_SPREAD, 1 + OBJECT_SPREAD, (len(seconds), 1))
+    away = widening * distance[:, None] * spread
     targets = np.array(OBJECT_TARGET) + rng.uniform(-0.012, 0.012, (len(seconds), 3))
     return _path(seconds, np.array(OBJECT_TARGET) + away * towards, targets, 0.4, rng)
 

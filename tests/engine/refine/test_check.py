@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from advtex_engine.refine.check import better
+from advtex_engine.refine.check import better, disagreement
 from advtex_engine.refine.points import Observations
 
 VIEWS = 4
@@ -50,3 +50,20 @@ def test_a_gain_that_may_be_none_is_not_taken() -> None:
 def test_too_few_cells_tell_nothing() -> None:
     assert not better(*scan(torch.full((5,), 0.1)), SCALE)
     assert better(*scan(torch.full((8,), 0.1)), SCALE)
+
+
+def test_views_that_are_asked_are_compared_with_the_rest_alone() -> None:
+    """Two of four views agree with each other and not with the rest: as one of all they would disagree less."""
+    old, _, valid, points, cell = scan(torch.full((8,), 1.0))
+    asked = torch.tensor([True, False, True, False])
+    off = old + 0.1 * asked[:, None, None]
+    among_all = disagreement(off, valid, points, SCALE)
+    found = disagreement(off, valid, points, SCALE, asked)
+    assert found.isnan().equal(~asked)
+    assert bool((found[asked] > among_all[asked]).all())
+    rest = off[~asked].mean(0)
+    assert torch.allclose(found[asked], (off[asked] - rest).abs().mean((1, 2)), atol=1e-3)
+    assert better(off, old, valid, points, cell, SCALE, asked)
+    # What the views that are not asked have become among themselves does not count.
+    worse = old + 0.3 * torch.tensor([0.0, 0.05, 0.0, -0.05])[:, None, None]
+    assert better(off, worse, valid, points, cell, SCALE, asked)

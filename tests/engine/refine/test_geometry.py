@@ -103,6 +103,24 @@ def test_depth_that_the_photographs_deny_is_not_followed(true_scene: Scene) -> N
     assert found.report["residual_after"] > found.report["residual_before"]
 
 
+def test_an_object_is_tried_by_photographs_alone_where_its_depth_has_its_errors(bumpy: Scene, true_scene: Scene) -> None:
+    """As of a mesh that was fused from it."""
+    views = tuple(replace(view, depth=rasterize(bumpy.mesh, view.camera).depth) for view in bumpy.views)
+    misled = replace(bumpy, views=views)
+    stayed = refine_geometry(misled, CPU, 0)
+    assert stayed.v_pos is None, "a room's mesh stays"
+    found = refine_geometry(replace(misled, kind="object"), CPU, 0)
+    assert found.v_pos is not None
+    assert error(found.v_pos, true_scene) < 0.4 * error(bumpy.mesh.v_pos, true_scene)
+    assert found.report["residual_after"] < geometry.ALONE_MARGIN * found.report["residual_before"]
+
+
+def test_an_object_that_is_right_stays_by_photographs_alone(true_scene: Scene) -> None:
+    found = refine_geometry(replace(with_depth(true_scene, 1.02), kind="object"), CPU, 0)
+    assert found.v_pos is None
+    assert not found.report["refined"]
+
+
 def test_vertices_move_along_their_normals_alone(bumpy: Scene, found: GeometryRefinement) -> None:
     assert found.v_pos is not None
     moved = found.v_pos - bumpy.mesh.v_pos
@@ -137,7 +155,7 @@ def test_the_far_side_of_a_wall_is_not_seen_where_errors_push_it_through(true_sc
     faces = torch.cat((near.t_pos_idx, near.t_pos_idx.flip(1) + len(far)))
     wall = replace(true_scene, mesh=Mesh(torch.cat((near.v_pos, far)), faces))
     color = geometry.working_color(wall.views, CPU)
-    seen = geometry._Surface(wall.mesh, wall, color, torch.Generator().manual_seed(0)).look(wall.mesh)
+    seen = geometry.Surface(wall.mesh, wall, color, torch.Generator().manual_seed(0)).look(wall.mesh)
     assert seen is not None
     drawn, looked_at = seen.surface.face, seen.points.point[seen.points.seen]
     assert int((drawn >= len(near.t_pos_idx)).sum()) > 500
@@ -150,7 +168,7 @@ def test_a_step_is_that_of_dense_normal_equations(bumpy: Scene, monkeypatch: pyt
     mesh = sheet(2.0, 6, (0.1, 4, 3, 0))
     scene = replace(bumpy, mesh=mesh)
     color = geometry.working_color(scene.views, CPU)
-    surface = geometry._Surface(mesh, scene, color, torch.Generator().manual_seed(0))
+    surface = geometry.Surface(mesh, scene, color, torch.Generator().manual_seed(0))
     seen = surface.look(mesh)
     assert seen is not None
     offsets = 0.002 * torch.randn(len(mesh.v_pos), generator=torch.Generator().manual_seed(1))
@@ -160,7 +178,14 @@ def test_a_step_is_that_of_dense_normal_equations(bumpy: Scene, monkeypatch: pyt
     points = replace(seen.points, position=seen.surface.on(surface.moved(offsets)))
     corners, weights = mesh.t_pos_idx[seen.surface.face], seen.surface.weights
     normal = (vertex_normals(mesh)[corners] * weights[..., None].float()).sum(1)
-    a, b = surface._evidence(features, seen, points, normal / normal.norm(dim=1, keepdim=True))
+    a, b = surface.evidence(
+        features,
+        seen,
+        points,
+        normal / normal.norm(dim=1, keepdim=True),
+        ~surface.aside[seen.surface.face][points.point],
+        geometry.DEPTH_WEIGHT,
+    )
     rows = torch.zeros(len(a), len(offsets), dtype=torch.float64).scatter_add_(1, corners, weights)
     matrix, right = rows.T @ (a.double()[:, None] * rows), rows.T @ b.double()
     reached = rows.T @ a.double()
@@ -174,15 +199,84 @@ def test_a_step_is_that_of_dense_normal_equations(bumpy: Scene, monkeypatch: pyt
         smooth[j, i] -= 1
     smooth = mean * (geometry.SMOOTH * smooth + geometry.SMALL * torch.eye(len(offsets)))
     change = torch.linalg.solve(matrix + smooth, right - smooth @ offsets.double())
-    most = geometry.MOST * surface._depth
+    most = geometry.MOST * surface.depth
     assert torch.allclose(found.double(), (offsets.double() + change).clamp(-most, most), atol=2e-5)
+
+
+def test_a_vector_step_is_that_of_dense_normal_equations(bumpy: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By photographs alone, of the views that count, and with vertices that are held in some directions."""
+    monkeypatch.setattr(geometry, "SOLVER_STEPS", 400)
+    monkeypatch.setattr(geometry, "LARGEST_STEP", 100.0)
+    mesh = sheet(2.0, 6, (0.1, 4, 3, 0))
+    color = geometry.working_color(bumpy.views, CPU)
+    surface = geometry.Surface(mesh, replace(bumpy, mesh=mesh), color, torch.Generator().manual_seed(0))
+    seen = surface.look(mesh)
+    assert seen is not None
+    count = len(mesh.v_pos)
+    generator = torch.Generator().manual_seed(1)
+    offsets = 0.002 * torch.randn(count, 3, generator=generator)
+    counted = (torch.arange(VIEWS) % 3 > 0)[:, None]
+    factors = torch.randn(count, 3, 2, generator=generator)
+    held = factors @ factors.mT * (torch.arange(count) % 4 == 0)[:, None, None]
+    found = surface.vector_step(offsets, seen, counted, held)
+
+    corners, weights = mesh.t_pos_idx[seen.surface.face], seen.surface.weights
+    points = replace(seen.points, position=seen.surface.on(replace(mesh, v_pos=mesh.v_pos + offsets)))
+    normal = (vertex_normals(mesh)[corners] * weights[..., None].float()).sum(1)
+    normal = normal / normal.norm(dim=1, keepdim=True)
+    a, b = surface.evidence(surface.features, seen, points, normal, counted, 0.0)
+    rows = torch.zeros(len(a), count, 3, dtype=torch.float64)
+    rows.scatter_add_(1, corners[..., None].expand(-1, -1, 3), weights[..., None] * normal.double()[:, None])
+    rows = rows.flatten(1)
+    reached = torch.zeros(count, dtype=torch.float64).index_add_(
+        0, corners.flatten(), (a.double()[:, None] * weights).flatten()
+    )
+    mean = reached.sum() / (reached > 0).sum()
+    laplacian = torch.zeros(count, count, dtype=torch.float64)
+    for i, j in {tuple(sorted((int(f[i]), int(f[i - 1])))) for f in mesh.t_pos_idx for i in range(3)}:
+        laplacian[[i, j], [i, j]] += 1
+        laplacian[[i, j], [j, i]] -= 1
+    smooth = torch.kron(geometry.SMOOTH * laplacian + geometry.SMALL * torch.eye(count), torch.eye(3)).double()
+    smooth = mean * (smooth + torch.block_diag(*held.double()))
+    change = torch.linalg.solve(
+        rows.T @ (a.double()[:, None] * rows) + smooth, rows.T @ b.double() - smooth @ offsets.double().flatten()
+    )
+    expected = offsets.double() + change.view(-1, 3)
+    most = geometry.MOST * surface.depth
+    expected *= (most / expected.norm(dim=1, keepdim=True)).clamp(max=1)
+    assert torch.allclose(found.double(), expected, atol=2e-5)
+
+
+def test_what_lies_at_an_outline_is_held_but_for_the_direction_to_the_view(true_scene: Scene) -> None:
+    """A square before a wall, seen by one view straight on: its border is held sideways, all else is free."""
+    near, wall = sheet(0.5, 10, (0.0, 0, 0, 0)), sheet(2.0, 10, (0.0, 0, 0, 0))
+    lifted = near.v_pos + torch.tensor([0.0, 0.0, 0.3])
+    mesh = Mesh(torch.cat((lifted, wall.v_pos)), torch.cat((near.t_pos_idx, wall.t_pos_idx + len(lifted))))
+    above = torch.eye(4, dtype=torch.float64)
+    above[1, 1] = above[2, 2] = -1
+    above[2, 3] = 2.0
+    view = replace(true_scene.views[0], camera=replace(true_scene.views[0].camera, world_to_camera=above), depth=None)
+    scene = Scene(mesh, (view, view), kind="object")
+    color = geometry.working_color(scene.views, CPU)
+    held = geometry.Surface(mesh, scene, color, torch.Generator().manual_seed(0)).held_at_outlines()
+    border = torch.zeros(len(mesh.v_pos), dtype=torch.bool)
+    border[: len(lifted)] = lifted[:, :2].abs().amax(1) > 0.249
+    inner = torch.zeros_like(border)
+    inner[: len(lifted)] = lifted[:, :2].abs().amax(1) < 0.15
+    assert bool((held[border].diagonal(dim1=1, dim2=2).sum(1) > 1.9 * geometry.OUTLINE).all())
+    assert bool((held[inner] == 0).all())
+    ray = torch.nn.functional.normalize(torch.tensor([0.0, 0.0, 2.0]) - mesh.v_pos[border], dim=1)
+    assert (held[border] @ ray[..., None]).abs().max() < 1e-5
+    inside_wall = torch.zeros_like(border)
+    inside_wall[len(lifted) :] = wall.v_pos[:, :2].abs().amax(1) < 0.7
+    assert bool((held[inside_wall] == 0).all())
 
 
 def test_the_evidence_is_the_slope_of_what_views_see(bumpy: Scene) -> None:
     """How far off and how sure, by differences of the samples as points move along their normals."""
     scene = without_depth(bumpy)
     color = geometry.working_color(scene.views, CPU)
-    surface = geometry._Surface(scene.mesh, scene, color, torch.Generator().manual_seed(0))
+    surface = geometry.Surface(scene.mesh, scene, color, torch.Generator().manual_seed(0))
     count = 50
     rows = torch.randint(len(scene.mesh.t_pos_idx), (count,), generator=torch.Generator().manual_seed(2))
     thirds = torch.full((count, 3), 1 / 3, dtype=torch.float64)
@@ -191,25 +285,25 @@ def test_the_evidence_is_the_slope_of_what_views_see(bumpy: Scene) -> None:
     candidates = Candidates(position, normal.double(), torch.ones(count), rows, thirds)
     every = torch.arange(count).expand(VIEWS, -1)
     points = Observations(position, every, torch.ones_like(every, dtype=torch.bool))
-    seen = geometry._Seen(candidates, points, torch.zeros(every.shape))
+    seen = geometry.Seen(candidates, points, torch.zeros(every.shape))
     # Linear images, so that differences are exact.
     down, across = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
     slopes = 0.01 * torch.randn(VIEWS, 2, generator=torch.Generator().manual_seed(3))
     value = slopes[:, :1, None] * across + slopes[:, 1:, None] * down
     features = torch.stack((value, *(slopes[:, k, None, None].expand_as(value) for k in (0, 1))), 1)
-    sure, pull = surface._evidence(features, seen, points, normal)
+    sure, pull = surface.evidence(features, seen, points, normal, ~surface.aside[rows][every], 0.0)
     step = 1e-3  # metres; the samples are float32
 
     def energy(move: float) -> Tensor:
         """Per point, for the weights that the residuals have where they are."""
         placed = replace(points, position=position + move * normal.double())
-        samples = geometry.sample_points(features, surface._K, surface._poses, placed, (WIDTH, HEIGHT))
-        base = geometry.sample_points(features, surface._K, surface._poses, points, (WIDTH, HEIGHT))
+        samples = geometry.sample_points(features, surface.K, surface.poses, placed, (WIDTH, HEIGHT))
+        base = geometry.sample_points(features, surface.K, surface.poses, points, (WIDTH, HEIGHT))
         residual, weight = geometry.residuals(base.value, base.valid, points, geometry.ROBUST_SCALE)
         now = residual + samples.value - base.value
         weight = weight.double()
         mean = (weight * now).sum(0) / weight.sum(0).clamp(min=1e-6)
-        kept = (~surface._aside[rows]).double()
+        kept = (~surface.aside[rows]).double()
         return kept * (weight * (now - mean).square()).sum(0) / geometry.ROBUST_SCALE**2
 
     slope = (energy(step) - energy(-step)) / (2 * step)
@@ -217,18 +311,18 @@ def test_the_evidence_is_the_slope_of_what_views_see(bumpy: Scene) -> None:
     ahead, behind = (
         geometry.sample_points(
             features,
-            surface._K,
-            surface._poses,
+            surface.K,
+            surface.poses,
             replace(points, position=position + sign * step * normal.double()),
             (WIDTH, HEIGHT),
         )
         for sign in (1, -1)
     )
-    base = geometry.sample_points(features, surface._K, surface._poses, points, (WIDTH, HEIGHT))
+    base = geometry.sample_points(features, surface.K, surface.poses, points, (WIDTH, HEIGHT))
     _, weight = geometry.residuals(base.value, base.valid, points, geometry.ROBUST_SCALE)
     slopes_of_views = (ahead.value - behind.value) / (2 * step)
     mean = (weight * slopes_of_views).sum(0) / weight.sum(0).clamp(min=1e-6)
-    squares = (weight * (slopes_of_views - mean).square()).sum(0) * ~surface._aside[rows] / geometry.ROBUST_SCALE**2
+    squares = (weight * (slopes_of_views - mean).square()).sum(0) * ~surface.aside[rows] / geometry.ROBUST_SCALE**2
     assert torch.allclose(squares, sure, rtol=0.05, atol=0.02 * float(sure.mean()))
 
 

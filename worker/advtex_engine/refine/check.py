@@ -19,12 +19,15 @@ SURE = 1.0  # standard error for one view: its cells are few, and what holds for
 VERY_SURE = 2.0  # and for all views together, by so many of which the gain has to be above what is worth a change
 
 
-def disagreement(value: Tensor, valid: Tensor, points: Observations, scale: float) -> Tensor:
+def disagreement(
+    value: Tensor, valid: Tensor, points: Observations, scale: float, asked: Tensor | None = None
+) -> Tensor:
     """Mean distance [V] of what each view sees from what the others see at the same points; nan if too few.
 
-    value: [V,K,C]; valid: [V,K]. A point's distance counts at most 2 * scale: beyond, something hides it.
+    value: [V,K,C]; valid: [V,K]. A point's distance counts at most 2 * scale: beyond, something hides it. asked: [V]
+    bool, views that are compared with the rest of them alone, the only ones that have a distance; None for all.
     """
-    rest, others = _others(value, valid, points, scale)
+    rest, others = _others(value, valid, points, scale, asked)
     mean, count = _mean(_distance(value, rest, scale), others)
     return torch.where(count >= MIN_CHECKED, mean, torch.nan)
 
@@ -45,16 +48,24 @@ def improved(
     return sure & (count >= MIN_CHECKED) & (mean_after < MARGIN * mean_before)
 
 
-def better(old: Tensor, new: Tensor, valid: Tensor, points: Observations, cell: Tensor, scale: float) -> bool:
+def better(
+    old: Tensor,
+    new: Tensor,
+    valid: Tensor,
+    points: Observations,
+    cell: Tensor,
+    scale: float,
+    asked: Tensor | None = None,
+) -> bool:
     """Whether all views together agree better among themselves by their new values than by their old ones.
 
     It has to be certain that the gain is worth a change, not only that there is one: a scan of a dozen views has few
     cells, but what halves their disagreement is no accident, and over many cells next to none is significant.
-    Arguments as for `improved`.
+    Arguments as for `improved`; asked: as for `disagreement`.
     """
     distances, counts = [], valid
     for value in (old, new):
-        rest, others = _others(value, valid, points, scale)
+        rest, others = _others(value, valid, points, scale, asked)
         distances.append(_distance(value, rest, scale))
         counts = counts & others
     before, after = ((distance * counts).flatten()[None] for distance in distances)
@@ -84,9 +95,13 @@ def _significant(gain: Tensor, counts: Tensor, cell: Tensor, errors: float) -> T
     return (occupied >= MIN_CELLS) & (sums.sum(1) > errors * spread.sqrt())
 
 
-def _others(value: Tensor, valid: Tensor, points: Observations, scale: float) -> tuple[Tensor, Tensor]:
+def _others(
+    value: Tensor, valid: Tensor, points: Observations, scale: float, asked: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Robust mean [V,K,C] of the other views at each point, and where there is one, [V,K] bool."""
     means, known = [], valid
+    if asked is not None:
+        known, valid = valid & asked[:, None], valid & ~asked[:, None]
     for channel in value.unbind(-1):
         _, weight = residuals(channel, valid, points, scale)
         mean, total = weighted_mean(channel, weight, points)

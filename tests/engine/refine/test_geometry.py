@@ -103,16 +103,29 @@ def test_depth_that_the_photographs_deny_is_not_followed(true_scene: Scene) -> N
     assert found.report["residual_after"] > found.report["residual_before"]
 
 
-def test_an_object_is_tried_by_photographs_alone_where_its_depth_has_its_errors(bumpy: Scene, true_scene: Scene) -> None:
+def test_an_object_is_tried_by_photographs_alone_where_its_depth_has_its_errors(
+    bumpy: Scene, true_scene: Scene
+) -> None:
     """As of a mesh that was fused from it."""
     views = tuple(replace(view, depth=rasterize(bumpy.mesh, view.camera).depth) for view in bumpy.views)
     misled = replace(bumpy, views=views)
-    stayed = refine_geometry(misled, CPU, 0)
-    assert stayed.v_pos is None, "a room's mesh stays"
+    assert refine_geometry(misled, CPU, 0).v_pos is None, "a room's mesh stays"
     found = refine_geometry(replace(misled, kind="object"), CPU, 0)
     assert found.v_pos is not None
     assert error(found.v_pos, true_scene) < 0.4 * error(bumpy.mesh.v_pos, true_scene)
     assert found.report["residual_after"] < geometry.ALONE_MARGIN * found.report["residual_before"]
+
+
+def test_an_object_whose_depth_has_gaps_is_not_tried_by_photographs_alone(bumpy: Scene) -> None:
+    """It is of a sensor that measures every place by itself."""
+
+    def measured(camera: Camera) -> Tensor:
+        depth = rasterize(bumpy.mesh, camera).depth
+        depth[50:70, 70:90] = 0
+        return depth
+
+    views = tuple(replace(view, depth=measured(view.camera)) for view in bumpy.views)
+    assert refine_geometry(replace(bumpy, views=views, kind="object"), CPU, 0).v_pos is None
 
 
 def test_an_object_that_is_right_stays_by_photographs_alone(true_scene: Scene) -> None:

@@ -11,13 +11,15 @@ surface: what is an edge stays one.
 Nothing is taken on trust: the photographs have no say in cells of the surface that were set aside, and the mesh stays
 as it came unless they agree better there afterwards.
 
-Depth may be the wrong thing to go by: a phone's is smooth where an object is not. So an object that it does not help is
-tried by its photographs alone. Within a cell nothing but smoothness would speak then, so that it is whole views that
-are set aside, and what they see tells; if they approve, the last steps are theirs as well. Offsets are vectors here,
-smooth in space, since those along normals tear corners apart. Where the surface turns away from a view, photographs say
-little of it, and whoever moved it would open gaps to what is behind: vertices there are held, but for the direction
-towards that view. Rooms are not tried: half of what they show are outlines before surfaces that no view has seen behind
-them, and gaps cost them more (icl_livingroom's LPIPS doubles) than all else gains (4 to 7 % of the disagreement).
+Depth may be the wrong thing to go by: a phone's, which it makes up between few readings and so lacks nowhere, is smooth
+where an object is not. If that does not help an object, its photographs are tried alone. Within a cell nothing but
+smoothness would speak then, so that it is whole views that are set aside, and what they see tells; if they approve, the
+last steps are theirs as well. Offsets are vectors here, smooth in space, since those along normals tear corners apart.
+Where the surface turns away from a view, photographs say little of it, and whoever moved it would open gaps to what is
+behind: vertices there are held, but for the direction towards that view. Objects before structured light are not tried
+(of five that were drawn four stay, one becomes 5 % worse), nor rooms: half of what they show are outlines before
+surfaces that no view has seen behind them, and gaps cost them more (icl_livingroom's LPIPS doubles) than all else
+gains.
 """
 
 from __future__ import annotations
@@ -50,6 +52,7 @@ from advtex_engine.refine.pose import ROBUST_SCALE, local_contrast, sample_point
 from advtex_engine.refine.solve import residuals, weighted_mean
 from advtex_engine.refine.working_views import CHECKED_SHARE, CONTRAST_SCALE, luminance, working_color
 from advtex_engine.render.rasterize import rasterize_views
+from advtex_engine.render.view_maps import DEPTH_TOLERANCE, always_read
 from advtex_engine.runtime.threads import fit_threads
 
 LEVELS = ((4, 3), (2, 3), (1, 3))  # shrink factor of the image, Gauss-Newton steps
@@ -120,7 +123,10 @@ def refine_geometry(scene: Scene, device: torch.device, seed: int) -> GeometryRe
             break
     report = {"refined": taken, **report}
     if not taken:
-        alone = by_photographs(given, first) if first is not None and scene.kind == "object" else None
+        alone = None
+        smooth = scene.kind == "object" and always_read(given.mesh, scene.views, DEPTH_TOLERANCE[scene.kind])
+        if smooth and first is not None:
+            alone = by_photographs(given, first)
         return alone or GeometryRefinement(None, report)
     report["moved_mm"] = round(1000 * float(offsets.abs().mean()), 3)
     return GeometryRefinement(given.moved(offsets).v_pos.cpu(), report)

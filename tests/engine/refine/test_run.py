@@ -22,7 +22,14 @@ from advtex_engine.core.scene import Camera, Mesh, Scene, View
 from advtex_engine.ingest.read import ingest
 from advtex_engine.pipeline import texture_scan
 from advtex_engine.refine.exposure import corrected_color, fit_exposure
-from advtex_engine.refine.points import Candidates, Observations, observe, surface_depths
+from advtex_engine.refine.points import (
+    CELLS_ACROSS,
+    Candidates,
+    Observations,
+    observe,
+    surface_cells,
+    surface_depths,
+)
 from advtex_engine.refine.pose import exponential, keep_gauge, local_contrast, pose_jacobian, sample_points, twist
 from advtex_engine.refine.run import (
     Refinement,
@@ -34,6 +41,8 @@ from advtex_engine.refine.run import (
 from advtex_engine.refine.solve import Anchor, residuals, solve_views, weighted_mean
 from advtex_engine.refine.working_views import working_views
 from advtex_engine.render.rasterize import rasterize
+from advtex_engine.synthetic.camera import Errors
+from advtex_engine.synthetic.real import synthesize_real
 from advtex_engine.synthetic.scan import synthesize
 
 VIEWS = 10
@@ -322,7 +331,7 @@ def test_the_solver_agrees_with_dense_least_squares(anchored: bool) -> None:
 
 
 def test_the_pose_jacobian_agrees_with_differences(true_scene: Scene) -> None:
-    cameras, depths = surface_depths(true_scene.mesh, true_scene.views[:2], (WIDTH, HEIGHT), "scene")
+    cameras, depths, _ = surface_depths(true_scene.mesh, true_scene.views[:2], (WIDTH, HEIGHT), "scene")
     vertices = true_scene.mesh.v_pos.double()
     candidates = scattered(vertices, torch.tensor([0.0, 0, 1]).double().expand_as(vertices))
     points = observe(candidates, torch.arange(len(vertices)), cameras, depths, 400)
@@ -352,7 +361,7 @@ def test_points_behind_something_and_near_its_outline_are_not_observed() -> None
     mesh = Mesh(torch.cat((wall, card)), torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]))
     camera = replace(camera_over(0, VIEWS), world_to_camera=torch.eye(4, dtype=torch.float64))
     view = View("view", camera, torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8))
-    cameras, depths = surface_depths(mesh, (view,), (WIDTH, HEIGHT), "scene")
+    cameras, depths, _ = surface_depths(mesh, (view,), (WIDTH, HEIGHT), "scene")
     # On the card; on the wall behind it; just beside its outline as seen from here; well beside.
     position = torch.tensor([[0.0, 0, 1], [0, 0, 2], [0.42, 0, 2], [0.7, 0, 2]], dtype=torch.float64)
     normal = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand_as(position)
@@ -422,3 +431,55 @@ def test_grossly_wrong_poses_are_found_from_depth_before_photographs_are_compare
     before, after = torch.tensor(off).median(0).values
     assert before > 5
     assert after < 0.2
+
+
+def test_what_is_behind_an_object_has_no_say_in_its_contrast() -> None:
+    generator = torch.Generator().manual_seed(6)
+    image, other = torch.rand(2, 1, 96, 128, generator=generator)
+    known = torch.zeros(1, 96, 128, dtype=torch.bool)
+    known[:, 30:70, 40:90] = True
+    for scale in (1, 2, 4, 8):
+        one, another = (
+            local_contrast(torch.where(known, image, behind), scale, known) for behind in (other, 0 * other)
+        )
+        assert torch.equal(one, another)
+        everything = local_contrast(image, scale, torch.ones_like(known))
+        torch.testing.assert_close(everything, local_contrast(image, scale), rtol=0, atol=1e-4)
+        inside = known[:, scale // 2 :: scale, scale // 2 :: scale]
+        assert one[:, 0][inside].abs().mean() > 0.3 * everything[:, 0][inside].abs().mean()
+
+
+def test_a_small_object_is_divided_into_enough_cells() -> None:
+    mesh = sheet(0.3, 10, (0.0, 1, 1, 0))
+    views = tuple(photograph(mesh, camera_over(i, VIEWS), f"view{i}", torch.ones(3), 0.0) for i in range(VIEWS))
+    cameras, depths, _ = surface_depths(mesh, views, (WIDTH, HEIGHT), "object")
+    position = torch.rand(1000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(7))
+    position = 0.3 * (position - 0.5) * torch.tensor([1, 1, 0])
+    cells = surface_cells(scattered(position, torch.zeros_like(position)), cameras, depths)
+    assert len(cells.unique()) > 0.5 * CELLS_ACROSS**2
+
+
+@pytest.mark.slow
+def test_cameras_far_from_a_small_object_find_their_places(tmp_path: Path) -> None:
+    """It covers a quarter of the image across; in coarse images what is around it is within reach of all its pixels."""
+    drift = replace(Errors.none(), drift=True)
+    synthesize_real(tmp_path, scene="object", views=12, width=192, height=144, seed=1, errors=drift)
+    scene = ingest(tmp_path, TextureConfig(size=(192, 144), device="cpu"), Monitor())
+    told = json.loads((tmp_path / "truth" / "cameras.json").read_text())["frames"]
+    true = {frame["name"]: torch.tensor(frame["camera_to_world"], dtype=torch.float64).inverse() for frame in told}
+    poses = torch.stack([view.camera.world_to_camera for view in scene.views])
+    truth = torch.stack([true[view.name] for view in scene.views])
+    refinement = refine_cameras(scene, CPU, 0)
+    vertices = scene.mesh.v_pos[::50].double()
+    every = torch.arange(len(vertices)).expand(len(poses), -1)
+    points = Observations(vertices, every, torch.ones_like(every, dtype=torch.bool))
+    off = []
+    for found in (poses, refinement.world_to_camera):
+        moved = keep_gauge(found, truth, points)
+        pixels = [
+            project(replace(scene.views[0].camera, world_to_camera=pose), vertices)[0] for pose in (*moved, *truth)
+        ]
+        off.append(torch.stack([(a - b).norm(dim=1).median() for a, b in zip(pixels[:12], pixels[12:], strict=True)]))
+    assert off[0].mean() > 1
+    assert off[1].max() < 0.3
+    assert not refinement.report["distortion"]["corrected"]

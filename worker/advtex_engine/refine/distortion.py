@@ -22,7 +22,6 @@ from advtex_engine.refine.pose import (
     ROBUST_SCALE,
     PointSamples,
     PoseSteps,
-    local_contrast,
     sample_features,
     sample_points,
 )
@@ -68,11 +67,11 @@ def fit_distortion(working: WorkingViews, points: Observations, found: Tensor, p
     Poses make up for most of what a lens does to one view, so that each step of the lens is what no pose can do
     instead; how poses depend on each other, they find out in steps of their own.
     """
-    luminance, K, given, spread, size = working.luminance, working.K, working.given, working.spread, working.size
+    K, given, spread, size = working.K, working.given, working.spread, working.size
     focal, reach = float(K[0, 0, 0]), _corner(K[0], size)
     unit = torch.tensor([1 / (focal * reach**3), 1 / (focal * reach**5)], device=K.device)  # a pixel at the corner
     for scale, steps in LEVELS:
-        features = working.features if scale == 1 else local_contrast(luminance, scale)
+        features = working.contrast(scale)
         for _ in range(steps):
             at = _through(found, features, K, poses, points, size)
             residual, weight = residuals(at.value, at.valid, points, ROBUST_SCALE)

@@ -39,6 +39,7 @@ from advtex_engine.core.scene import Mesh, Scene
 from advtex_engine.mesh.normals import vertex_normals
 from advtex_engine.refine.check import MARGIN, better, disagreement
 from advtex_engine.refine.points import (
+    CELL_SIZE,
     EDGE_STEP,
     Candidates,
     Observations,
@@ -50,7 +51,7 @@ from advtex_engine.refine.points import (
 )
 from advtex_engine.refine.pose import ROBUST_SCALE, local_contrast, sample_points
 from advtex_engine.refine.solve import residuals, weighted_mean
-from advtex_engine.refine.working_views import CHECKED_SHARE, CONTRAST_SCALE, luminance, working_color
+from advtex_engine.refine.working_views import CHECKED_SHARE, CONTRAST_SCALE, known_pixels, luminance, working_color
 from advtex_engine.render.rasterize import rasterize_views
 from advtex_engine.render.view_maps import DEPTH_TOLERANCE, always_read
 from advtex_engine.runtime.threads import fit_threads
@@ -112,7 +113,7 @@ def refine_geometry(scene: Scene, device: torch.device, seed: int) -> GeometryRe
         seen = given.look(given.moved(offsets)) if report else first
         if first is None or seen is None:
             break
-        features = given.features if scale == 1 else local_contrast(luminance(color), scale)
+        features = given.contrast(scale)
         for _ in range(steps):
             fit_threads()
             offsets = given.step(offsets, features, seen, scale)
@@ -139,14 +140,16 @@ class Surface:
         self.mesh, self._scene, self._generator = mesh, scene, generator
         self.normal = vertex_normals(mesh)
         self._size = (color.shape[3], color.shape[2])
-        self.features = local_contrast(luminance(color), 1)
-        self.cameras, self._depths = cameras, depths = surface_depths(mesh, scene.views, self._size, scene.kind)
+        cameras, depths, shown = surface_depths(mesh, scene.views, self._size, scene.kind)
+        self.cameras, self._depths = cameras, depths
+        self._color, self._known = color, known_pixels(shown, scene.kind)
+        self.features = local_contrast(luminance(color), 1, self._known)
         self.K, self.poses = stack_cameras(cameras, mesh.v_pos.device)
         some = depths.flatten()[:: max(1, depths.numel() // MEDIAN_OF)]  # to sort all takes four times their memory
         self.depth = float(some[some > 0].median()) if bool((some > 0).any()) else 1.0
         sides = torch.cat([mesh.t_pos_idx[:, [a, b]] for a, b in ((0, 1), (1, 2), (2, 0))]).sort(1).values
         self.edges, _ = distinct_rows(sides)
-        self.cell = grid_cells(mesh.v_pos[mesh.t_pos_idx].double().mean(1), self.depth)
+        self.cell = grid_cells(mesh.v_pos[mesh.t_pos_idx].double().mean(1), CELL_SIZE * self.depth)
         share = torch.rand(int(self.cell.max()) + 1, generator=generator)
         self.aside = (share < CHECKED_SHARE).to(self.cell.device)[self.cell]
 
@@ -154,11 +157,15 @@ class Surface:
         """The mesh with its vertices moved by offsets [V] metres along their normals."""
         return Mesh(self.mesh.v_pos + offsets[:, None] * self.normal, self.mesh.t_pos_idx)
 
+    def contrast(self, scale: int) -> Tensor:
+        """The views' `local_contrast` at a shrink factor."""
+        return self.features if scale == 1 else local_contrast(luminance(self._color), scale, self._known)
+
     def look(self, mesh: Mesh) -> Seen | None:
         """Points of the mesh and who sees them; None where hardly anything is seen by two views."""
         cameras, depths = self.cameras, self._depths
         if mesh is not self.mesh:
-            _, depths = surface_depths(mesh, self._scene.views, self._size, self._scene.kind)
+            _, depths, _ = surface_depths(mesh, self._scene.views, self._size, self._scene.kind)
         detail = torch.hypot(*self.features[:, 1:].unbind(1))
         surface = draw_candidates(mesh, cameras, depths, detail, self._generator)
         if len(surface.position) < MIN_POINTS:

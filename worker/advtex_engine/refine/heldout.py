@@ -57,7 +57,7 @@ def _refined_pose(
     working = working_views(atlas.mesh, (view, model), kind, texture.device, seed)
     if working is None:
         return None, torch.zeros(3)
-    found = refine_poses(working.luminance, working.K, working.given, working.fitted)
+    found = refine_poses(working.contrast, working.size, kind, working.K, working.given, working.fitted)
     before, after = (
         sample_points(working.features, working.K, pose, working.checked, working.size)
         for pose in (working.given, found)

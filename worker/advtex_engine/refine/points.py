@@ -27,6 +27,7 @@ MIN_COSINE = 0.2  # between the surface's normal and the ray: beyond 78 degrees 
 BORDER = 3.0  # pixels from the image's edge
 DETAIL_FLOOR = 0.1  # preference for a point without any detail, relative to the mean detail
 CELL_SIZE = 0.08  # of the median depth: about 25 of 320 pixels
+CELLS_ACROSS = 8  # at least, what a view sees of a small object: by a few cells nothing could be said of it
 
 
 @dataclass(frozen=True)
@@ -66,26 +67,30 @@ class Candidates:
 
 def surface_depths(
     mesh: Mesh, views: tuple[View, ...], size: tuple[int, int], kind: str
-) -> tuple[list[Camera], Tensor]:
-    """The cameras at `size` (width, height) and what they see of the mesh, [V,h,w] float32 metres.
+) -> tuple[list[Camera], Tensor, Tensor]:
+    """The cameras at `size` (width, height), what they see of the mesh, [V,h,w] float32 metres, and which pixels show
+    it at all, [V,h,w] bool.
 
-    0 where nothing is hit, near a depth edge, where the device's depth shows something else than the mesh, and where
-    the view's mask leaves a pixel out.
+    Depth is 0 where nothing is hit, near a depth edge, where the device's depth shows something else than the mesh, and
+    where the view's mask leaves a pixel out.
     """
     width, height = size
     cameras = [scaled_camera(view.camera, width, height) for view in views]
-    depths = []
+    depths, shown = [], []
     for view, fragments in zip(views, rasterize_views(mesh, cameras), strict=True):
         depth = fragments.depth
-        keep = (fragments.face_index >= 0) & ~_near_edge(depth)
+        hit = fragments.face_index >= 0
+        keep = hit & ~_near_edge(depth)
         if view.depth is not None:
             measured = F.interpolate(view.depth[None, None].to(depth.device), (height, width), mode="nearest")[0, 0]
             keep &= (measured == 0) | ((measured - depth).abs() < DEPTH_TOLERANCE[kind])
         if view.mask is not None:
             used = view.mask[None, None].to(depth)
-            keep &= -F.adaptive_max_pool2d(-used, (height, width))[0, 0] > 0
+            wholly = -F.adaptive_max_pool2d(-used, (height, width))[0, 0] > 0
+            keep, hit = keep & wholly, hit & wholly
         depths.append(torch.where(keep, depth, 0.0))
-    return cameras, torch.stack(depths)
+        shown.append(hit)
+    return cameras, torch.stack(depths), torch.stack(shown)
 
 
 def _near_edge(depth: Tensor) -> Tensor:
@@ -146,14 +151,20 @@ def order_of_preference(candidates: Candidates, generator: torch.Generator) -> T
     return (wait.to(weight.device) / weight.clamp(min=1e-12)).argsort()
 
 
-def surface_cells(candidates: Candidates, depths: Tensor) -> Tensor:
-    """[N] int64: the cell of a grid in space, CELL_SIZE of the median of `depths` wide, that each point lies in."""
-    return grid_cells(candidates.position, depths[depths > 0].median().double())
+def surface_cells(candidates: Candidates, cameras: list[Camera], depths: Tensor) -> Tensor:
+    """[N] int64: the cell of a grid in space that each point lies in.
+
+    depths: what the cameras see, [V,h,w]. Cells are CELL_SIZE of their median wide, or less, so that there are
+    CELLS_ACROSS of them to what a view sees.
+    """
+    across = (depths > 0).flatten(1).sum(1).double().sqrt().median() / float(cameras[0].K[0, 0])
+    width = (across / CELLS_ACROSS).clamp(max=CELL_SIZE)
+    return grid_cells(candidates.position, float(width * depths[depths > 0].median()))
 
 
-def grid_cells(position: Tensor, depth: Tensor | float) -> Tensor:
-    """[N] int64: the cell of a grid in space, CELL_SIZE of this depth wide, that each position [N,3] lies in."""
-    return distinct_rows((position / (CELL_SIZE * depth)).floor().long())[1]
+def grid_cells(position: Tensor, width: float) -> Tensor:
+    """[N] int64: the cell of a grid in space, so many metres wide, that each position [N,3] lies in."""
+    return distinct_rows((position / width).floor().long())[1]
 
 
 def _looks(position: Tensor, normal: Tensor, cameras: list[Camera], depths: Tensor) -> Iterator[tuple[Tensor, Tensor]]:

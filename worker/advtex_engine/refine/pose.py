@@ -8,6 +8,7 @@ Parameters are scaled to about a pixel: a twist of (1/f, 1/f, 1/f, z/f, z/f, z/f
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -18,10 +19,12 @@ from advtex_engine.refine.points import Observations
 from advtex_engine.refine.solve import Anchor, residuals, solve_views
 from advtex_engine.render.filtering import separable
 
-LEVELS = ((8, 6), (4, 6), (2, 5), (1, 4))  # shrink factor of the image, Gauss-Newton steps
+# Shrink factor of the image, Gauss-Newton steps. All cameras around an object together find their way slowly.
+LEVELS = {"scene": ((8, 6), (4, 6), (2, 5), (1, 4)), "object": ((8, 6), (4, 6), (2, 5), (1, 8))}
 AT_ONCE = 16  # views whose local contrast is found at once
 CONTRAST_RADIUS = 4  # pixels of the level around which local mean and contrast are taken
 CONTRAST_FLOOR = 0.04  # of the range: what is flatter than that counts less
+LEAST_SHARE = 1e-4  # of pixels that have a say, for there to be anything
 ROBUST_SCALE = 0.3  # residual, in local contrasts, at which an observation loses half of its weight
 ANCHOR = 0.1  # pull of each place towards where the given cameras show it on the average, relative to the evidence
 PRIOR = 0.001  # pull towards the given pose, relative to the mean strength of the evidence
@@ -44,8 +47,12 @@ class PointSamples:
     valid: Tensor
 
 
-def local_contrast(luminance: Tensor, scale: int) -> Tensor:
-    """[V,h,w] in [0,1] -> [V,3,h/scale,w/scale]: normalized value and its gradient per pixel of the full image."""
+def local_contrast(luminance: Tensor, scale: int, known: Tensor | None = None) -> Tensor:
+    """[V,h,w] in [0,1] -> [V,3,h/scale,w/scale]: normalized value and its gradient per pixel of the full image.
+
+    known: [V,h,w] bool, the pixels that have a say, None for all. What stands behind an object moves against it when
+    the camera moves, and in a small image it is within reach of all of the object's pixels.
+    """
     size = (luminance.shape[1], luminance.shape[2])
     if scale > 1:
         size = (max(8, size[0] // scale), max(8, size[1] // scale))
@@ -53,23 +60,38 @@ def local_contrast(luminance: Tensor, scale: int) -> Tensor:
     # Of all views at once it would take four times the memory of what is found.
     for first in range(0, len(luminance), AT_ONCE):
         views = slice(first, first + AT_ONCE)
-        found[views] = _local_contrast(luminance[views], size)
+        found[views] = _local_contrast(luminance[views], size, None if known is None else known[views])
     return found
 
 
-def _local_contrast(luminance: Tensor, size: tuple[int, int]) -> Tensor:
-    image = luminance[:, None]
+def _local_contrast(luminance: Tensor, size: tuple[int, int], known: Tensor | None) -> Tensor:
+    image, share = luminance[:, None], None if known is None else known[:, None].to(luminance)
     height, width = image.shape[2:]
+    if share is not None:
+        image = image * share
     if size != (height, width):
         image = F.interpolate(image, size, mode="area")
+        share = None if share is None else F.interpolate(share, size, mode="area")
     image = _blurred(image, 1)
-    mean = _blurred(image, CONTRAST_RADIUS)
-    deviation = (_blurred(image.square(), CONTRAST_RADIUS) - mean.square()).clamp(min=0).sqrt()
+    if share is not None:
+        near = _blurred(share, 1)
+        image = image / near.clamp(min=LEAST_SHARE)
+    mean = _mean(image, share)
+    deviation = (_mean(image.square(), share) - mean.square()).clamp(min=0).sqrt()
     value = (image - mean) / (deviation + CONTRAST_FLOOR)
+    if share is not None:
+        value = value * (near > LEAST_SHARE)
     padded = F.pad(value, (1, 1, 1, 1), mode="replicate")
     across = (padded[:, :, 1:-1, 2:] - padded[:, :, 1:-1, :-2]) * (0.5 * image.shape[3] / width)
     down = (padded[:, :, 2:, 1:-1] - padded[:, :, :-2, 1:-1]) * (0.5 * image.shape[2] / height)
     return torch.cat((value, across, down), 1)
+
+
+def _mean(image: Tensor, share: Tensor | None) -> Tensor:
+    """Local mean of images [V,1,h,w] within CONTRAST_RADIUS, of pixels that count by their `share`, None for all."""
+    if share is None:
+        return _blurred(image, CONTRAST_RADIUS)
+    return _blurred(image * share, CONTRAST_RADIUS) / _blurred(share, CONTRAST_RADIUS).clamp(min=LEAST_SHARE)
 
 
 def _blurred(image: Tensor, radius: int) -> Tensor:
@@ -102,26 +124,25 @@ def sample_features(features: Tensor, pixel: Tensor, size: tuple[int, int]) -> t
 
 
 def refine_poses(
-    luminance: Tensor,
+    contrast: Callable[[int], Tensor],
+    size: tuple[int, int],
+    kind: str,
     K: Tensor,
     given: Tensor,
     points: Observations,
     spread: Observations | None = None,
-    finest: Tensor | None = None,
 ) -> Tensor:
     """world_to_camera [V,4,4] float64 that make the views agree; coarse to fine.
 
-    luminance: [V,h,w] float32 in [0,1]. K: [V,3,3] float64 for that size. points: those compared. spread: points all
-    over the surface, whose content is to stay where it is on the average; the mean motion of all cameras is removed
-    after each level but the finest: the mesh does not move with the cameras, so that they agree best where the mesh
-    is, and what they have in common beyond the anchor's pull is what the photographs insist on. Without, the first
-    view alone moves, and the others hold the gauge. finest: the luminance's `local_contrast` at full resolution, where
-    it is at hand.
+    contrast: the views' `local_contrast` at a shrink factor of their `size` (width, height). kind: of the scan. K:
+    [V,3,3] float64 for that size. points: those compared. spread: points all over the surface, whose content is to stay
+    where it is on the average; the mean motion of all cameras is removed after each level but the finest: the mesh does
+    not move with the cameras, so that they agree best where the mesh is, and what they have in common beyond the
+    anchor's pull is what the photographs insist on. Without, the first view alone moves, and the others hold the gauge.
     """
-    size = (luminance.shape[2], luminance.shape[1])
     world_to_camera = given
-    for scale, steps in LEVELS:
-        features = finest if scale == 1 and finest is not None else local_contrast(luminance, scale)
+    for scale, steps in LEVELS[kind]:
+        features = contrast(scale)
         for _ in range(steps):
             samples = sample_points(features, K, world_to_camera, points, size)
             residual, weight = residuals(samples.value, samples.valid, points, ROBUST_SCALE)

@@ -8,6 +8,7 @@ Ten numbers for all frames together make small, dense normal equations (`refine_
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -18,7 +19,6 @@ from advtex_engine.refine.pose import (
     ROBUST_SCALE,
     PointSamples,
     exponential,
-    local_contrast,
     pose_jacobian,
     sample_points,
     twist,
@@ -49,17 +49,19 @@ class Device:
         return Device(scale @ self.lens @ torch.linalg.inv(scale), self.offset)
 
 
-def refine_device(luminance: Tensor, K: Tensor, given: Tensor, points: Observations) -> Device:
+def refine_device(
+    contrast: Callable[[int], Tensor], size: tuple[int, int], K: Tensor, given: Tensor, points: Observations
+) -> Device:
     """The device with which the views agree best while each keeps its place beside the others; coarse to fine.
 
-    luminance: [V,h,w] float32 in [0,1]. K: [V,3,3], given: [V,4,4] world_to_camera, float64.
+    contrast: the views' `local_contrast` at a shrink factor of their `size` (width, height). K: [V,3,3] and given:
+    [V,4,4], world_to_camera, float64.
     """
-    size = (luminance.shape[2], luminance.shape[1])
     center = torch.eye(3, dtype=K.dtype, device=K.device)
     center[:2, 2] = center.new_tensor(size) / 2
     device = Device(torch.eye(3, dtype=K.dtype, device=K.device), torch.eye(4, dtype=K.dtype, device=K.device))
     for scale, steps in LEVELS:
-        features = local_contrast(luminance, scale)
+        features = contrast(scale)
         for _ in range(steps):
             lens, pose = device.lens @ K, device.offset @ given
             samples = sample_points(features, lens, pose, points, size)

@@ -196,7 +196,7 @@ def _device(working: WorkingViews) -> tuple[Device | None, dict[str, Any]]:
     """A correction that the checked points clearly approve of, at the working size, and the report about it."""
     fitted, checked = working.fitted, working.checked
     few = Observations(fitted.position, fitted.point[:, :DEVICE_POINTS], fitted.seen[:, :DEVICE_POINTS])
-    found = refine_device(working.luminance, working.K, working.given, few)
+    found = refine_device(working.contrast, working.size, working.K, working.given, few)
     before = sample_points(working.features, working.K, working.given, checked, working.size)
     after = sample_points(working.features, found.lens @ working.K, found.offset @ working.given, checked, working.size)
     both = before.valid & after.valid
@@ -275,9 +275,8 @@ def _poses(working: WorkingViews, given: Tensor) -> tuple[Tensor, dict[str, Tens
     given: [V,4,4], what they have to be better than; where the search begins is in `working`.
     """
     checked, cell = working.checked, working.checked_cell
-    found = refine_poses(
-        working.luminance, working.K, working.given, working.fitted, working.spread, finest=working.features
-    )
+    poses = working.K, working.given
+    found = refine_poses(working.contrast, working.size, working.kind, *poses, working.fitted, working.spread)
     before = sample_points(working.features, working.K, given, checked, working.size)
     good = torch.ones(len(given), dtype=torch.bool, device=given.device)
     # One view's return to its given pose changes what the others are compared with.

@@ -35,11 +35,14 @@ LUMINANCE = (0.299, 0.587, 0.114)
 class WorkingViews:
     """V views at the working size.
 
-    color: [V,3,h,w] float32 in [0,1]. features: `local_contrast` at full resolution. K [V,3,3], given [V,4,4]: float64.
-    checked_cell: `surface_cells` of the points to check.
+    color: [V,3,h,w] float32 in [0,1]. known: [V,h,w] bool, the pixels whose contrast is compared, None for all.
+    features: `local_contrast` at full resolution. K [V,3,3], given [V,4,4]: float64. checked_cell: `surface_cells` of
+    the points to check.
     """
 
+    kind: str
     color: Tensor
+    known: Tensor | None
     features: Tensor
     K: Tensor
     given: Tensor
@@ -58,6 +61,10 @@ class WorkingViews:
         """[V,h,w] float32 in [0,1]."""
         return luminance(self.color)
 
+    def contrast(self, scale: int) -> Tensor:
+        """The views' `local_contrast` at a shrink factor."""
+        return self.features if scale == 1 else local_contrast(self.luminance, scale, self.known)
+
 
 def working_views(
     mesh: Mesh, views: tuple[View, ...], kind: str, device: torch.device, seed: int, like: WorkingViews | None = None
@@ -67,19 +74,23 @@ def working_views(
     mesh = Mesh(mesh.v_pos.to(device), mesh.t_pos_idx.to(device))
     color = working_color(views, device) if like is None else like.color
     size = (color.shape[3], color.shape[2])
-    features = local_contrast(luminance(color), 1) if like is None else like.features
-    cameras, depths = surface_depths(mesh, views, size, kind)
+    cameras, depths, shown = surface_depths(mesh, views, size, kind)
+    if like is None:
+        known = known_pixels(shown, kind)
+        features = local_contrast(luminance(color), 1, known)
+    else:
+        known, features = like.known, like.features
     K, given = stack_cameras(cameras, device)
     candidates = draw_candidates(mesh, cameras, depths, torch.hypot(*features[:, 1:].unbind(1)), generator)
     if len(candidates.position) < MIN_CANDIDATES:
         return None
     order = order_of_preference(candidates, generator)
-    cell = surface_cells(candidates, depths)[order]
+    cell = surface_cells(candidates, cameras, depths)[order]
     aside = (torch.rand(int(cell.max()) + 1, generator=generator) < CHECKED_SHARE).to(device)[cell]
     checked = observe(candidates, order[aside], cameras, depths, CHECKED_PER_VIEW)
     fitted = observe(candidates, order[~aside], cameras, depths, POINTS_PER_VIEW)
     spread = observe(candidates, order[::SPREAD_STRIDE], cameras, depths, POINTS_PER_VIEW // 4)
-    return WorkingViews(color, features, K, given, fitted, spread, checked, cell[aside])
+    return WorkingViews(kind, color, known, features, K, given, fitted, spread, checked, cell[aside])
 
 
 def working_color(views: Sequence[View], device: torch.device) -> Tensor:
@@ -88,6 +99,14 @@ def working_color(views: Sequence[View], device: torch.device) -> Tensor:
     width = min(WORKING_WIDTH, camera.width)
     size = (width, max(1, round(camera.height * width / camera.width)))
     return torch.cat([_shrunk(view.color.to(device), size) for view in views])
+
+
+def known_pixels(shown: Tensor, kind: str) -> Tensor | None:
+    """Pixels that `local_contrast` looks at, [V,h,w] bool, None for all; shown: of `surface_depths`.
+
+    A room is all around; its mesh lacks what depth could not measure, which stands still all the same.
+    """
+    return shown if kind == "object" else None
 
 
 def luminance(color: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Camera, Mesh, Scene, View
 from advtex_engine.ingest.read import ingest
 from advtex_engine.pipeline import texture_scan
+from advtex_engine.refine.check import MIN_CELLS
 from advtex_engine.refine.exposure import corrected_color, fit_exposure
 from advtex_engine.refine.points import (
     CELLS_ACROSS,
@@ -455,8 +456,10 @@ def test_a_small_object_is_divided_into_enough_cells() -> None:
     cameras, depths, _ = surface_depths(mesh, views, (WIDTH, HEIGHT), "object")
     position = torch.rand(1000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(7))
     position = 0.3 * (position - 0.5) * torch.tensor([1, 1, 0])
-    cells = surface_cells(scattered(position, torch.zeros_like(position)), cameras, depths)
-    assert len(cells.unique()) > 0.5 * CELLS_ACROSS**2
+    candidates = scattered(position, torch.zeros_like(position))
+    of_object, of_room = (surface_cells(candidates, cameras, depths, kind) for kind in ("object", "scene"))
+    assert len(of_object.unique()) > 0.5 * CELLS_ACROSS**2
+    assert len(of_room.unique()) < MIN_CELLS**2
 
 
 @pytest.mark.slow

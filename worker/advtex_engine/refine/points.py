@@ -27,7 +27,7 @@ MIN_COSINE = 0.2  # between the surface's normal and the ray: beyond 78 degrees 
 BORDER = 3.0  # pixels from the image's edge
 DETAIL_FLOOR = 0.1  # preference for a point without any detail, relative to the mean detail
 CELL_SIZE = 0.08  # of the median depth: about 25 of 320 pixels
-CELLS_ACROSS = 8  # at least, what a view sees of a small object: by a few cells nothing could be said of it
+CELLS_ACROSS = 8  # at least, what a view sees of an object: by a few cells nothing could be said of a small one
 
 
 @dataclass(frozen=True)
@@ -151,15 +151,17 @@ def order_of_preference(candidates: Candidates, generator: torch.Generator) -> T
     return (wait.to(weight.device) / weight.clamp(min=1e-12)).argsort()
 
 
-def surface_cells(candidates: Candidates, cameras: list[Camera], depths: Tensor) -> Tensor:
+def surface_cells(candidates: Candidates, cameras: list[Camera], depths: Tensor, kind: str) -> Tensor:
     """[N] int64: the cell of a grid in space that each point lies in.
 
-    depths: what the cameras see, [V,h,w]. Cells are CELL_SIZE of their median wide, or less, so that there are
-    CELLS_ACROSS of them to what a view sees.
+    depths: what the cameras see, [V,h,w]. Cells are CELL_SIZE of their median wide, those of an object less if need be,
+    so that there are CELLS_ACROSS of them to what a view sees.
     """
-    across = (depths > 0).flatten(1).sum(1).double().sqrt().median() / float(cameras[0].K[0, 0])
-    width = (across / CELLS_ACROSS).clamp(max=CELL_SIZE)
-    return grid_cells(candidates.position, float(width * depths[depths > 0].median()))
+    width = CELL_SIZE
+    if kind == "object":
+        across = (depths > 0).flatten(1).sum(1).double().sqrt().median() / float(cameras[0].K[0, 0])
+        width = min(width, float(across) / CELLS_ACROSS)
+    return grid_cells(candidates.position, width * float(depths[depths > 0].median()))
 
 
 def grid_cells(position: Tensor, width: float) -> Tensor:

@@ -85,7 +85,7 @@ def working_views(
     if len(candidates.position) < MIN_CANDIDATES:
         return None
     order = order_of_preference(candidates, generator)
-    cell = surface_cells(candidates, cameras, depths)[order]
+    cell = surface_cells(candidates, cameras, depths, kind)[order]
     aside = (torch.rand(int(cell.max()) + 1, generator=generator) < CHECKED_SHARE).to(device)[cell]
     checked = observe(candidates, order[aside], cameras, depths, CHECKED_PER_VIEW)
     fitted = observe(candidates, order[~aside], cameras, depths, POINTS_PER_VIEW)

@@ -12,6 +12,7 @@ from wavy_sheet import HEIGHT, WIDTH, camera_over, paint, sheet
 from advtex_engine.core.scene import Camera, Mesh, Scene, View
 from advtex_engine.mesh.normals import vertex_normals
 from advtex_engine.refine import geometry
+from advtex_engine.refine.check import MARGIN
 from advtex_engine.refine.geometry import GeometryRefinement, refine_geometry
 from advtex_engine.refine.points import Candidates, Observations
 from advtex_engine.refine.run import (
@@ -103,34 +104,40 @@ def test_depth_that_the_photographs_deny_is_not_followed(true_scene: Scene) -> N
     assert found.report["residual_after"] > found.report["residual_before"]
 
 
-def test_an_object_is_tried_by_photographs_alone_where_its_depth_has_its_errors(
-    bumpy: Scene, true_scene: Scene
-) -> None:
-    """As of a mesh that was fused from it."""
+@pytest.fixture(scope="module")
+def misled(bumpy: Scene) -> Scene:
+    """An object whose depth has the errors of its mesh, as of one that was fused from it."""
     views = tuple(replace(view, depth=rasterize(bumpy.mesh, view.camera).depth) for view in bumpy.views)
-    misled = replace(bumpy, views=views)
-    assert refine_geometry(misled, CPU, 0).v_pos is None, "a room's mesh stays"
-    found = refine_geometry(replace(misled, kind="object"), CPU, 0)
+    return replace(bumpy, views=views, kind="object")
+
+
+def test_an_object_is_tried_by_photographs_alone_where_its_depth_has_its_errors(
+    misled: Scene, true_scene: Scene
+) -> None:
+    assert refine_geometry(replace(misled, kind="scene"), CPU, 0).v_pos is None, "a room's mesh stays"
+    found = refine_geometry(misled, CPU, 0)
     assert found.v_pos is not None
-    assert error(found.v_pos, true_scene) < 0.4 * error(bumpy.mesh.v_pos, true_scene)
-    assert found.report["residual_after"] < geometry.ALONE_MARGIN * found.report["residual_before"]
+    assert found.alone
+    assert error(found.v_pos, true_scene) < 0.4 * error(misled.mesh.v_pos, true_scene)
+    assert found.report["residual_after"] < MARGIN * found.report["residual_before"]
 
 
-def test_an_object_whose_depth_has_gaps_is_not_tried_by_photographs_alone(bumpy: Scene) -> None:
-    """It is of a sensor that measures every place by itself."""
-
-    def measured(camera: Camera) -> Tensor:
-        depth = rasterize(bumpy.mesh, camera).depth
-        depth[50:70, 70:90] = 0
-        return depth
-
-    views = tuple(replace(view, depth=measured(view.camera)) for view in bumpy.views)
-    assert refine_geometry(replace(bumpy, views=views, kind="object"), CPU, 0).v_pos is None
+def test_what_photographs_alone_have_moved_they_move_again(misled: Scene, true_scene: Scene) -> None:
+    """By the cameras that were found beside it; no view is left then that could judge."""
+    found = refine_geometry(misled, CPU, 0, alone=True)
+    assert found.v_pos is not None
+    assert found.alone
+    assert error(found.v_pos, true_scene) < 0.4 * error(misled.mesh.v_pos, true_scene)
+    refinement = refine_scene(misled, CPU, 0)
+    assert [told["refined"] for told in refinement.report["geometry"]] == [True, True]
+    assert refinement.v_pos is not None
+    assert error(refinement.v_pos, true_scene) < 0.4 * error(misled.mesh.v_pos, true_scene)
 
 
 def test_an_object_that_is_right_stays_by_photographs_alone(true_scene: Scene) -> None:
     found = refine_geometry(replace(with_depth(true_scene, 1.02), kind="object"), CPU, 0)
     assert found.v_pos is None
+    assert not found.alone
     assert not found.report["refined"]
 
 

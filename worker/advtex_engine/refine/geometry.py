@@ -11,21 +11,20 @@ surface: what is an edge stays one.
 Nothing is taken on trust: the photographs have no say in cells of the surface that were set aside, and the mesh stays
 as it came unless they agree better there afterwards.
 
-Depth may be the wrong thing to go by: a phone's, which it makes up between few readings and so lacks nowhere, is smooth
-where an object is not. If that does not help an object, its photographs are tried alone. Within a cell nothing but
-smoothness would speak then, so that it is whole views that are set aside, and what they see tells; if they approve, the
-last steps are theirs as well. Offsets are vectors here, smooth in space, since those along normals tear corners apart.
+Depth may be the wrong thing to go by: what a phone makes up between few readings is smooth where an object is not, and
+structured light is off by millimetres all around it. If that does not help an object, its photographs are tried alone:
+offsets along the normals that are far from what is there are looked at as well (`sweep`), and then vertices descend to
+what is finest. Within a cell nothing but smoothness would speak here, so that it is whole views that are set aside, and
+what they see tells. Offsets of the descent are vectors, smooth in space, since those along normals tear corners apart.
 Where the surface turns away from a view, photographs say little of it, and whoever moved it would open gaps to what is
-behind: vertices there are held, but for the direction towards that view. Objects before structured light are not tried
-(of five that were drawn four stay, one becomes 5 % worse), nor rooms: half of what they show are outlines before
-surfaces that no view has seen behind them, and gaps cost them more (icl_livingroom's LPIPS doubles) than all else
-gains.
+behind: vertices there are held then, but for the direction towards that view. Rooms are not tried: half of what they
+show are outlines before surfaces that no view has seen behind them, and gaps cost them more (icl_livingroom's LPIPS
+doubles) than all else gains; where they are swept, views that were set aside refuse it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -50,10 +49,10 @@ from advtex_engine.refine.points import (
     surface_depths,
 )
 from advtex_engine.refine.pose import ROBUST_SCALE, local_contrast, sample_points
-from advtex_engine.refine.solve import residuals, weighted_mean
+from advtex_engine.refine.solve import conjugate_gradients, residuals, weighted_mean
+from advtex_engine.refine.sweep import sweep_offsets
 from advtex_engine.refine.working_views import CHECKED_SHARE, CONTRAST_SCALE, known_pixels, luminance, working_color
 from advtex_engine.render.rasterize import rasterize_views
-from advtex_engine.render.view_maps import DEPTH_TOLERANCE, always_read
 from advtex_engine.runtime.threads import fit_threads
 
 LEVELS = ((4, 3), (2, 3), (1, 3))  # shrink factor of the image, Gauss-Newton steps
@@ -66,11 +65,8 @@ DEPTH_WEIGHT = 0.2
 LEAST_DEVIATION = 0.001  # metres, of the depth's readings
 LARGEST_STEP = 3.0  # pixels of the level
 MOST = 0.04  # of the median depth
-ALONE_STEPS, LAST_STEPS = 4, 2  # of photographs alone, at the finest level, and then of those that were set aside too
+ALONE_STEPS = 2  # of descent by photographs alone, at the finest level, once they were swept
 ASIDE = 4  # one view of so many is set aside
-ALONE_MARGIN = 0.92
-"""Of the disagreement of views set aside may be left for a mesh by photographs alone: drawn objects, whose textures
-gain 3 to 7 %, keep .84 to .91."""
 OUTLINE, OUTLINE_REACH = 2.0, 2
 """Pull to where vertices at outlines were, across the rays of the views that see them so, relative to the mean evidence
 and shared by all views; and how many pixels beside an outline they lie."""
@@ -81,10 +77,14 @@ MEDIAN_OF = 1_000_000  # readings at least, of which the middle depth is told
 
 @dataclass(frozen=True)
 class GeometryRefinement:
-    """v_pos [V,3] float32, None to leave the mesh as it came; and the report about it."""
+    """v_pos [V,3] float32, None to leave the mesh as it came; and the report about it.
+
+    alone: the photographs moved it alone.
+    """
 
     v_pos: Tensor | None
     report: dict[str, Any]
+    alone: bool = False
 
 
 @dataclass(frozen=True)
@@ -96,8 +96,10 @@ class Seen:
     measured: Tensor
 
 
-def refine_geometry(scene: Scene, device: torch.device, seed: int) -> GeometryRefinement:
+def refine_geometry(scene: Scene, device: torch.device, seed: int, alone: bool = False) -> GeometryRefinement:
     """Vertices along their normals, from the training views' photographs and depth; held-out views are not read.
+
+    alone: photographs alone have moved this mesh before, by other cameras; they do it again.
 
     The report's residuals are mean disagreements of the views, in local contrasts, at points where the photographs had
     no say; None where too few views share such points. On a CPU the same input and seed give the same result. Not
@@ -109,6 +111,8 @@ def refine_geometry(scene: Scene, device: torch.device, seed: int) -> GeometryRe
     offsets = torch.zeros(len(given.mesh.v_pos), device=device)
     taken, report = False, dict[str, Any]()
     first = given.look(given.mesh)
+    if alone and first is not None:
+        return swept_again(given, first)
     for scale, steps in LEVELS:
         seen = given.look(given.moved(offsets)) if report else first
         if first is None or seen is None:
@@ -124,11 +128,8 @@ def refine_geometry(scene: Scene, device: torch.device, seed: int) -> GeometryRe
             break
     report = {"refined": taken, **report}
     if not taken:
-        alone = None
-        smooth = scene.kind == "object" and always_read(given.mesh, scene.views, DEPTH_TOLERANCE[scene.kind])
-        if smooth and first is not None:
-            alone = by_photographs(given, first)
-        return alone or GeometryRefinement(None, report)
+        found = by_photographs(given, first) if scene.kind == "object" and first is not None else None
+        return found or GeometryRefinement(None, report)
     report["moved_mm"] = round(1000 * float(offsets.abs().mean()), 3)
     return GeometryRefinement(given.moved(offsets).v_pos.cpu(), report)
 
@@ -219,7 +220,7 @@ class Surface:
         diagonal = torch.zeros_like(offsets).index_add_(0, corners.flatten(), squares)
         diagonal = diagonal + mean * (SMOOTH * degree + SMALL)
         rest = to_vertices(pull) - smoothness(offsets)
-        change = conjugate_gradients(product, rest, diagonal)
+        change = conjugate_gradients(product, rest, diagonal, SOLVER_STEPS)
         longest = LARGEST_STEP * scale * self.depth / float(self.K[0, 0, 0])
         most = MOST * self.depth
         return (offsets + change.clamp(-longest, longest)).clamp(-most, most)
@@ -258,9 +259,26 @@ class Surface:
         degree = torch.bincount(self.edges.flatten(), minlength=len(offsets)).to(offsets)[:, None]
         diagonal = torch.zeros_like(offsets).index_add_(0, corners.flatten(), squares)
         diagonal = diagonal + mean * (SMOOTH * degree + SMALL + held.diagonal(dim1=1, dim2=2))
-        change = conjugate_gradients(product, to_vertices(pull) - smoothness(offsets), diagonal)
+        right = to_vertices(pull) - smoothness(offsets)
+        change = conjugate_gradients(product, right, diagonal, SOLVER_STEPS)
         longest = LARGEST_STEP * self.depth / float(self.K[0, 0, 0])
         return _at_most(offsets + _at_most(change, longest), MOST * self.depth)
+
+    def swept(self, used: Tensor) -> Mesh:
+        """The mesh by the photographs of views `used` ([V] bool) alone: swept, and then ALONE_STEPS of descent."""
+        rows = used.nonzero()[:, 0]
+        cameras = [self.cameras[row] for row in rows.tolist()]
+        gray = luminance(self._color)[rows]
+        mesh = self.moved(sweep_offsets(self.mesh, self.edges, cameras, self._depths[rows], gray, self.depth))
+        there = Surface(mesh, self._scene, self._color, self._generator)
+        seen = there.look(mesh)
+        if seen is None:
+            return mesh
+        held, offsets = there.held_at_outlines(), torch.zeros_like(mesh.v_pos)
+        for _ in range(ALONE_STEPS):
+            fit_threads()
+            offsets = there.vector_step(offsets, seen, used[:, None], held)
+        return Mesh(mesh.v_pos + offsets, mesh.t_pos_idx)
 
     def held_at_outlines(self) -> Tensor:
         """[V,3,3]: what pulls a vertex's offset back, the sum over the views that see it at an outline, of OUTLINE
@@ -332,39 +350,24 @@ class Surface:
 
 
 def by_photographs(given: Surface, seen: Seen) -> GeometryRefinement | None:
-    """The vertices by photographs alone; None unless views that were set aside agree far better with the others."""
+    """The vertices by photographs alone; None unless views that were set aside agree better with the others."""
     asked = torch.arange(len(given.poses), device=given.poses.device) % ASIDE == ASIDE // 2
-    held, offsets = given.held_at_outlines(), torch.zeros_like(given.mesh.v_pos)
-    for _ in range(ALONE_STEPS):
-        fit_threads()
-        offsets = given.vector_step(offsets, seen, ~asked[:, None], held)
-    mesh = given.mesh
-    found = Mesh(mesh.v_pos + offsets, mesh.t_pos_idx)
-    taken, report = given.judged(found, seen, seen.points.seen, asked)
-    if not taken or report["residual_after"] > ALONE_MARGIN * report["residual_before"]:
-        return None
-    for _ in range(LAST_STEPS):
-        offsets = given.vector_step(offsets, seen, torch.ones_like(asked)[:, None], held)
-    report["moved_mm"] = round(1000 * float(offsets.norm(dim=1).mean()), 3)
-    return GeometryRefinement((mesh.v_pos + offsets).cpu(), {"refined": True, **report})
+    taken, report = given.judged(given.swept(~asked), seen, seen.points.seen, asked)
+    return _moved_alone(given, given.swept(torch.ones_like(asked)), report) if taken else None
+
+
+def swept_again(given: Surface, seen: Seen) -> GeometryRefinement:
+    """The vertices by photographs alone, which have been approved of: no view could judge what it has made itself."""
+    found = given.swept(torch.ones_like(given.poses[:, 0, 0], dtype=torch.bool))
+    return _moved_alone(given, found, given.judged(found, seen, seen.points.seen)[1])
+
+
+def _moved_alone(given: Surface, found: Mesh, report: dict[str, Any]) -> GeometryRefinement:
+    moved = round(1000 * float((found.v_pos - given.mesh.v_pos).norm(dim=1).mean()), 3)
+    return GeometryRefinement(found.v_pos.cpu(), {"refined": True, **report, "moved_mm": moved}, alone=True)
 
 
 def _at_most(vectors: Tensor, length: float) -> Tensor:
     """Vectors [N,3] cut to a length."""
     factor: Tensor = length / vectors.norm(dim=1, keepdim=True).clamp(min=1e-12)
     return vectors * factor.clamp(max=1)
-
-
-def conjugate_gradients(product: Callable[[Tensor], Tensor], right: Tensor, diagonal: Tensor) -> Tensor:
-    """x [V] with product(x) = right, about; preconditioned with the matrix's diagonal."""
-    x, rest = torch.zeros_like(right), right
-    direction = condition = rest / diagonal
-    energy = (rest * condition).sum()
-    for _ in range(SOLVER_STEPS):
-        image = product(direction)
-        length = energy / (direction * image).sum().clamp(min=1e-30)
-        x, rest = x + length * direction, rest - length * image
-        condition = rest / diagonal
-        before, energy = energy, (rest * condition).sum()
-        direction = condition + energy / before.clamp(min=1e-30) * direction
-    return x

@@ -80,6 +80,7 @@ def refine_scene(scene: Scene, device: torch.device, seed: int) -> Refinement:
     """
     refinement = refine_cameras(scene, device, seed)
     rounds = list[dict[str, Any]]()
+    alone = False
     while len(rounds) < ROUNDS:
         refined = apply_refinement(scene, refinement)
         if rounds:
@@ -87,7 +88,8 @@ def refine_scene(scene: Scene, device: torch.device, seed: int) -> Refinement:
             refinement = replace(refinement, world_to_camera=again.world_to_camera)
             refined = apply_refinement(scene, refinement)
         give_back_unused()  # what cameras took, before geometry takes as much
-        geometry = refine_geometry(refined, device, seed)
+        geometry = refine_geometry(refined, device, seed, alone)
+        alone = geometry.alone
         rounds.append(geometry.report)
         if geometry.v_pos is None:
             break

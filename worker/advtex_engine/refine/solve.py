@@ -9,6 +9,7 @@ is a mean) couples the views instead, and conjugate gradients solve that without
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -121,3 +122,18 @@ def solve_views(
         before, energy = energy, (rest * condition).sum()
         direction = condition + energy / before.clamp(min=1e-30) * direction
     return step
+
+
+def conjugate_gradients(product: Callable[[Tensor], Tensor], right: Tensor, diagonal: Tensor, steps: int) -> Tensor:
+    """x [V] or [V,Q] with product(x) = right, about; preconditioned with the matrix's diagonal."""
+    x, rest = torch.zeros_like(right), right
+    direction = condition = rest / diagonal
+    energy = (rest * condition).sum()
+    for _ in range(steps):
+        image = product(direction)
+        length = energy / (direction * image).sum().clamp(min=1e-30)
+        x, rest = x + length * direction, rest - length * image
+        condition = rest / diagonal
+        before, energy = energy, (rest * condition).sum()
+        direction = condition + energy / before.clamp(min=1e-30) * direction
+    return x

@@ -302,9 +302,10 @@ def test_the_evidence_is_the_slope_of_what_views_see(bumpy: Scene) -> None:
     thirds = torch.full((count, 3), 1 / 3, dtype=torch.float64)
     position = (scene.mesh.v_pos.double()[scene.mesh.t_pos_idx[rows]] * thirds[..., None]).sum(1)
     normal = torch.nn.functional.normalize(vertex_normals(scene.mesh)[scene.mesh.t_pos_idx[rows]].sum(1), dim=1)
-    candidates = Candidates(position, normal.double(), torch.ones(count), rows, thirds)
     every = torch.arange(count).expand(VIEWS, -1)
-    points = Observations(position, every, torch.ones_like(every, dtype=torch.bool))
+    seen_by_all = torch.ones_like(every, dtype=torch.bool)
+    candidates = Candidates(position, normal.double(), torch.ones(count), rows, thirds, seen_by_all.mT)
+    points = Observations(position, every, seen_by_all)
     seen = geometry.Seen(candidates, points, torch.zeros(every.shape))
     # Linear images, so that differences are exact.
     down, across = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")

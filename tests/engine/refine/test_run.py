@@ -27,6 +27,7 @@ from advtex_engine.refine.points import (
     CELLS_ACROSS,
     Candidates,
     Observations,
+    looks,
     observe,
     surface_cells,
     surface_depths,
@@ -85,10 +86,20 @@ def misplaced(scene: Scene, pixels: float) -> Scene:
     return replace(scene, views=tuple(views))
 
 
-def scattered(position: Tensor, normal: Tensor) -> Candidates:
+def scattered(position: Tensor, normal: Tensor, seen: Tensor | None = None) -> Candidates:
     """Points of no face in particular."""
     count = len(position)
-    return Candidates(position, normal, torch.ones(count), torch.zeros(count).long(), torch.zeros(count, 3).double())
+    seen = torch.ones((count, 0), dtype=torch.bool) if seen is None else seen
+    return Candidates(
+        position, normal, torch.ones(count), torch.zeros(count).long(), torch.zeros(count, 3).double(), seen
+    )
+
+
+def observed(position: Tensor, normal: Tensor, cameras: list[Camera], depths: Tensor, most: int) -> Observations:
+    seen = torch.zeros((len(position), len(cameras)), dtype=torch.bool)
+    for view, (rows, _) in enumerate(looks(position, normal, cameras, depths)):
+        seen[rows, view] = True
+    return observe(scattered(position, normal, seen), most)
 
 
 def errors(scene: Scene, truth: Scene) -> Tensor:
@@ -334,8 +345,8 @@ def test_the_solver_agrees_with_dense_least_squares(anchored: bool) -> None:
 def test_the_pose_jacobian_agrees_with_differences(true_scene: Scene) -> None:
     cameras, depths, _ = surface_depths(true_scene.mesh, true_scene.views[:2], (WIDTH, HEIGHT), "scene")
     vertices = true_scene.mesh.v_pos.double()
-    candidates = scattered(vertices, torch.tensor([0.0, 0, 1]).double().expand_as(vertices))
-    points = observe(candidates, torch.arange(len(vertices)), cameras, depths, 400)
+    normal = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand_as(vertices)
+    points = observed(vertices, normal, cameras, depths, 400)
     K = torch.stack([camera.K for camera in cameras])
     poses = torch.stack([camera.world_to_camera for camera in cameras])
     # A linear image, so that the derivative of the sampled value is exact.
@@ -366,7 +377,7 @@ def test_points_behind_something_and_near_its_outline_are_not_observed() -> None
     # On the card; on the wall behind it; just beside its outline as seen from here; well beside.
     position = torch.tensor([[0.0, 0, 1], [0, 0, 2], [0.42, 0, 2], [0.7, 0, 2]], dtype=torch.float64)
     normal = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand_as(position)
-    points = observe(scattered(position, normal), torch.arange(4), cameras, depths, 10)
+    points = observed(position, normal, cameras, depths, 10)
     seen = points.position[points.point[points.seen]]
     assert seen.tolist() == [[0.0, 0, 1], [0.7, 0, 2]]
     assert int(points.seen.sum()) == 2

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
-import torch.nn.functional as F
 from plane import SIDE, blurred, maps_of, noise
 
-from advtex_engine.render.filtering import window_sums
 from advtex_engine.render.view_maps import ViewMaps
 from advtex_engine.selection.back_projection import back_project
 
@@ -46,14 +43,6 @@ def test_each_texel_hears_its_own_view_alone() -> None:
     assert torch.equal(clean[:, : SIDE // 2], spoiled[:, : SIDE // 2])
     assert not torch.equal(clean[:, SIDE // 2 :], spoiled[:, SIDE // 2 :])
     assert not torch.equal(clean[5:, : SIDE // 2], start[5:, : SIDE // 2])
-
-
-@pytest.mark.parametrize("reach", [0, 1, 2, 3, 4, 7])
-def test_windows_are_summed_as_a_pool_of_ones_does(reach: int) -> None:
-    planes = torch.rand((3, 37, 52), generator=torch.Generator().manual_seed(4))
-    side = 2 * reach + 1
-    expected = side**2 * F.avg_pool2d(planes.double(), side, 1, reach)
-    torch.testing.assert_close(window_sums(planes, reach).double(), expected, atol=0, rtol=1e-6)
 
 
 def test_a_view_that_shows_nothing_of_its_own_is_passed_over() -> None:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from advtex_engine.core.scene import Camera, Mesh, face_areas
+from advtex_engine.render.filtering import greatest
 
 # Of more cameras an even selection is measured: quantiles over views change little, and memory stays bounded.
 MAX_CAMERAS = 160
@@ -85,7 +86,7 @@ def _density_in(camera: Camera, points: Tensor, normal: Tensor) -> Tensor:
     nearest = torch.full((rows * columns,), torch.inf)
     nearest.scatter_reduce_(0, cell[seen], z[seen], "amin")
     # A 3x3 minimum closes the holes between points that lie further apart than a cell.
-    nearest = -torch.nn.functional.max_pool2d(-nearest.view(1, 1, rows, columns), 3, 1, 1).view(-1)
+    nearest = -greatest(-nearest.view(rows, columns), 1).view(-1)
 
     samples = len(normal)
     visible = seen[:samples] & (z[:samples] < nearest[cell[:samples]] * (1 + DEPTH_TOLERANCE))

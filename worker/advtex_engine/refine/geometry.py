@@ -52,6 +52,7 @@ from advtex_engine.refine.pose import ROBUST_SCALE, local_contrast, sample_point
 from advtex_engine.refine.solve import conjugate_gradients, residuals, weighted_mean
 from advtex_engine.refine.sweep import sweep_offsets
 from advtex_engine.refine.working_views import CHECKED_SHARE, CONTRAST_SCALE, known_pixels, luminance, working_color
+from advtex_engine.render.filtering import greatest
 from advtex_engine.render.rasterize import rasterize_views
 from advtex_engine.runtime.threads import fit_threads
 
@@ -172,9 +173,7 @@ class Surface:
         if len(surface.position) < MIN_POINTS:
             return None
         surface = surface.chosen(order_of_preference(surface, self._generator))
-        everything = torch.arange(len(surface.position), device=depths.device)
-        most = min(POINTS_PER_VIEW, max(1, LOOKS // len(cameras)))
-        points = observe(surface, everything, cameras, depths, most)
+        points = observe(surface, min(POINTS_PER_VIEW, max(1, LOOKS // len(cameras))))
         samples = sample_points(self.features, self.K, self.poses, points, self._size)
         normal = surface.normal[points.point].float() @ self.poses[:, :3, :3].mT.float()
         facing = (normal * samples.local).sum(-1) < 0
@@ -284,12 +283,10 @@ class Surface:
         """[V,3,3]: what pulls a vertex's offset back, the sum over the views that see it at an outline, of OUTLINE
         across their rays, shared by all views."""
         held = torch.zeros((len(self.mesh.v_pos), 3, 3), device=self.mesh.v_pos.device)
-        side = 2 * OUTLINE_REACH + 1
         for fragments, pose in zip(rasterize_views(self.mesh, self.cameras), self.poses.float(), strict=True):
             hit = fragments.face_index >= 0
             depth = torch.where(hit, fragments.depth, torch.inf)
-            behind = F.max_pool2d(depth[None, None], side, stride=1, padding=OUTLINE_REACH)[0, 0]
-            faces = fragments.face_index[hit & (behind > (1 + EDGE_STEP) * depth)].long()
+            faces = fragments.face_index[hit & (greatest(depth, OUTLINE_REACH) > (1 + EDGE_STEP) * depth)].long()
             beside = torch.zeros(len(held), dtype=torch.bool, device=held.device)
             beside[self.mesh.t_pos_idx[faces]] = True
             vertices = beside.nonzero()[:, 0]

@@ -13,9 +13,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advtex_engine.core.cameras import project, scaled_camera
+from advtex_engine.core.cameras import scaled_camera
 from advtex_engine.core.rows import distinct_rows
 from advtex_engine.core.scene import Camera, Mesh, View
+from advtex_engine.render.filtering import greatest
 from advtex_engine.render.rasterize import rasterize_views
 from advtex_engine.render.view_maps import DEPTH_TOLERANCE
 
@@ -47,7 +48,7 @@ class Observations:
 class Candidates:
     """Surface points that at least two views see: position and normal [N,3] float64 (world), and detail [N] >= 0.
 
-    face: [N] int64, where each lies. weights: [N,3] float64, of the face's corners.
+    face: [N] int64, where each lies. weights: [N,3] float64, of the face's corners. seen: [N,V] bool, by which views.
     """
 
     position: Tensor
@@ -55,6 +56,7 @@ class Candidates:
     detail: Tensor
     face: Tensor
     weights: Tensor
+    seen: Tensor
 
     def chosen(self, rows: Tensor) -> Candidates:
         """Some of them, by rows [M] int64 or [N] bool."""
@@ -95,11 +97,8 @@ def surface_depths(
 
 def _near_edge(depth: Tensor) -> Tensor:
     """[h,w] bool: within EDGE_RADIUS of a jump in depth or of the mesh's outline."""
-    padded = F.pad(depth[None, None], (1, 1, 1, 1), mode="replicate")
-    most = F.max_pool2d(padded, 3, stride=1)
-    least = -F.max_pool2d(-padded, 3, stride=1)
-    edge = (most - least > 2 * EDGE_STEP * most).to(torch.float32)
-    return F.max_pool2d(edge, 2 * EDGE_RADIUS + 1, stride=1, padding=EDGE_RADIUS)[0, 0] > 0
+    most, least = greatest(depth, 1), -greatest(-depth, 1)
+    return greatest(most - least > 2 * EDGE_STEP * most, EDGE_RADIUS)
 
 
 def draw_candidates(
@@ -123,25 +122,25 @@ def draw_candidates(
     position = (corners[face] * weights[..., None]).sum(1).to(device)
     unit = (normal[face] / area[face].clamp(min=1e-30)[:, None]).to(device)
     total = torch.zeros(CANDIDATES, dtype=torch.float64, device=device)
-    count = torch.zeros_like(total)
-    for view, (seen, pixel) in enumerate(_looks(position, unit, cameras, depths)):
-        total.index_add_(0, seen, detail[view].flatten()[pixel].double())
-        count[seen] += 1
+    seen = torch.zeros((CANDIDATES, len(cameras)), dtype=torch.bool, device=device)
+    for view, (rows, pixel) in enumerate(looks(position, unit, cameras, depths)):
+        total[rows] += detail[view].flatten()[pixel]
+        seen[rows, view] = True
+    count = seen.sum(1)
     detail_of = total / count.clamp(min=1)
-    return Candidates(position, unit, detail_of, face.to(device), weights.to(device)).chosen(count >= 2)
+    return Candidates(position, unit, detail_of, face.to(device), weights.to(device), seen).chosen(count >= 2)
 
 
-def observe(candidates: Candidates, chosen: Tensor, cameras: list[Camera], depths: Tensor, most: int) -> Observations:
-    """The first `most` of the candidates `chosen` ([M] int64, in order of preference) that each view sees."""
-    position, normal = candidates.position[chosen], candidates.normal[chosen]
-    device = position.device
-    point = torch.zeros((len(cameras), most), dtype=torch.int64, device=device)
-    seen = torch.zeros((len(cameras), most), dtype=torch.bool, device=device)
-    for view, (found, _) in enumerate(_looks(position, normal, cameras, depths)):
-        taken = found[:most]
+def observe(candidates: Candidates, most: int) -> Observations:
+    """The first `most` of the candidates that each view sees."""
+    views = candidates.seen.shape[1]
+    point = torch.zeros((views, most), dtype=torch.int64, device=candidates.seen.device)
+    seen = torch.zeros_like(point, dtype=torch.bool)
+    for view in range(views):
+        taken = candidates.seen[:, view].nonzero()[:most, 0]
         point[view, : len(taken)] = taken
         seen[view, : len(taken)] = True
-    return Observations(position, point, seen)
+    return Observations(candidates.position, point, seen)
 
 
 def order_of_preference(candidates: Candidates, generator: torch.Generator) -> Tensor:
@@ -169,18 +168,25 @@ def grid_cells(position: Tensor, width: float) -> Tensor:
     return distinct_rows((position / width).floor().long())[1]
 
 
-def _looks(position: Tensor, normal: Tensor, cameras: list[Camera], depths: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    """Per view: the points [S] int64 that it sees, in order, and the pixels [S] (flat) where it sees them."""
+def looks(position: Tensor, normal: Tensor, cameras: list[Camera], depths: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Per view: the points (position and normal [N,3], world) [S] int64 that it sees, in order, and the pixels [S]
+    (flat) where it sees them.
+
+    depths: [V,h,w] of `surface_depths`.
+    """
     height, width = depths.shape[1:]
+    points, normals = (part.mT.contiguous() for part in (position, normal))
     for camera, depth in zip(cameras, depths, strict=True):
-        pixels, z = project(camera, position)
-        x, y = pixels.unbind(1)
-        inside = (z > 0) & (x > BORDER) & (x < width - BORDER) & (y > BORDER) & (y < height - BORDER)
-        near = inside.nonzero()[:, 0]
-        pixel = y[near].long() * width + x[near].long()
-        surface = depth.flatten()[pixel].double()
-        rotation = camera.world_to_camera[:3, :3].to(position)
-        ray = position[near] @ rotation.T + camera.world_to_camera[:3, 3].to(position)
-        cosine = ((normal[near] @ rotation.T) * ray).sum(1).abs() / ray.norm(dim=1)
-        seen = (surface > 0) & (z[near] < surface * (1 + SURFACE_TOLERANCE)) & (cosine > MIN_COSINE)
+        K, pose = camera.K.to(position), camera.world_to_camera.to(position)
+        x, y, z = (K @ pose[:3, :3]) @ points + (K @ pose[:3, 3])[:, None]
+        inside = (x > BORDER * z) & (x < (width - BORDER) * z) & (y > BORDER * z) & (y < (height - BORDER) * z)
+        near = (inside & (z > 0)).nonzero()[:, 0]
+        far = z[near]
+        pixel = (y[near] / far).long() * width + (x[near] / far).long()
+        surface = depth.flatten()[pixel]
+        shown = (surface > 0) & (far < surface.double() * (1 + SURFACE_TOLERANCE))
+        near, pixel = near[shown], pixel[shown]
+        ray = points[:, near] + (pose[:3, :3].T @ pose[:3, 3])[:, None]
+        cosine = (normals[:, near] * ray).sum(0).abs() / ray.square().sum(0).sqrt()
+        seen = cosine > MIN_COSINE
         yield near[seen], pixel[seen]

@@ -87,9 +87,9 @@ def working_views(
     order = order_of_preference(candidates, generator)
     cell = surface_cells(candidates, cameras, depths, kind)[order]
     aside = (torch.rand(int(cell.max()) + 1, generator=generator) < CHECKED_SHARE).to(device)[cell]
-    checked = observe(candidates, order[aside], cameras, depths, CHECKED_PER_VIEW)
-    fitted = observe(candidates, order[~aside], cameras, depths, POINTS_PER_VIEW)
-    spread = observe(candidates, order[::SPREAD_STRIDE], cameras, depths, POINTS_PER_VIEW // 4)
+    checked = observe(candidates.chosen(order[aside]), CHECKED_PER_VIEW)
+    fitted = observe(candidates.chosen(order[~aside]), POINTS_PER_VIEW)
+    spread = observe(candidates.chosen(order[::SPREAD_STRIDE]), POINTS_PER_VIEW // 4)
     return WorkingViews(kind, color, known, features, K, given, fitted, spread, checked, cell[aside])
 
 

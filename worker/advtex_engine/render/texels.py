@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from advtex_engine.core.scene import Atlas, Camera, Mesh
+from advtex_engine.render.filtering import greatest
 from advtex_engine.render.rasterize import rasterize
 
 REACH = 2  # texels; the padding that charts have
@@ -104,15 +105,7 @@ def _heights(corners: Tensor) -> Tensor:
 def _grow(face: Tensor, steps: int) -> Tensor:
     """Empty texels (-1) of [H,W] take a face of their eight neighbors, `steps` times; the highest index wins."""
     for _ in range(steps):
-        around = face
-        for axis in (0, 1):  # max_pool2d, of doubles for the sake of large indices, takes a CPU three times as long
-            count = face.shape[axis] - 1
-            here, there = around.clone(), around
-            for first, second in ((0, 1), (1, 0)):
-                side = here.narrow(axis, first, count)
-                torch.maximum(side, there.narrow(axis, second, count), out=side)
-            around = here
-        face = torch.where(face >= 0, face, around)
+        face = torch.where(face >= 0, face, greatest(face, 1))
     return face
 
 

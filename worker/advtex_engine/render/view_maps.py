@@ -11,11 +11,10 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from advtex_engine.core.scene import Atlas, Mesh, View
-from advtex_engine.render.filtering import window_sums
+from advtex_engine.render.filtering import greatest, window_sums
 from advtex_engine.render.prefetch import uploaded
 from advtex_engine.render.rasterize import rasterize_views
 from advtex_engine.render.texture import bilinear_footprint, decode_uv, encode_uv, number_slots, touched_slots
@@ -163,20 +162,13 @@ def always_read(mesh: Mesh, views: Sequence[View], tolerance: float) -> bool:
         assert view.depth is not None
         rendered = torch.where(fragments.face_index >= 0, fragments.depth, 0.0)
         reach = round(UNMEASURED * rendered.shape[1])
-        nearest, farthest = -_most(-rendered, reach), _most(rendered, reach)
+        nearest, farthest = -greatest(-rendered, reach), greatest(rendered, reach)
         surface = (nearest > 0) & (farthest - nearest < tolerance)
         if view.mask is not None:
             surface = surface & view.mask.to(surface.device)
         inside += int(surface.sum())
         lacking += int((surface & (view.depth == 0).to(surface.device)).sum())
     return lacking < ALWAYS_READ * inside
-
-
-def _most(values: Tensor, reach: int) -> Tensor:
-    """[H,W]: the greatest of values [H,W] within so many rows and columns."""
-    side = 2 * reach + 1
-    rows = F.max_pool2d(values[None, None], (side, 1), stride=1, padding=(reach, 0))
-    return F.max_pool2d(rows, (1, side), stride=1, padding=(0, reach))[0, 0]
 
 
 def contradicted(measured: Tensor, rendered: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:

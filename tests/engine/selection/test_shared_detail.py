@@ -8,11 +8,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plane import HEIGHT, SIDE, WIDTH, blurred, maps_of, noise
+from plane import HEIGHT, SIDE, WIDTH, blurred, maps_of, noise, sampled
 from torch import Tensor
 
 from advtex_engine.render.filtering import blurred as gaussian
-from advtex_engine.render.texture import number_slots, sample_texels
+from advtex_engine.render.texture import decode_uv, number_slots, sample_texels
 from advtex_engine.render.view_maps import ViewMaps
 from advtex_engine.selection import shared_detail
 from advtex_engine.selection.shared_detail import displacement, share_detail
@@ -51,6 +51,34 @@ def test_grain_fades_and_detail_stays() -> None:
     assert error(found, truth) < 0.8 * error(start, truth)
     strength = [float(image[INNER, INNER].diff(dim=0).abs().mean()) for image in (found, truth)]
     assert strength[0] > 0.95 * strength[1]
+
+
+def bent(seed: int, height: int, width: int) -> Tensor:
+    """Displacements [h,w,2] of parts of a pixel in the right half, too narrow to be found; none in the left one."""
+    field = gaussian(torch.randn((2, height, width), generator=torch.Generator().manual_seed(seed)), 2.0)
+    field = 0.4 * field / field.std()
+    field[:, :, : width // 2] = 0
+    return field.permute(1, 2, 0)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_detail_is_as_strong_where_photographs_agree_in_part(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mean of photographs that are bent, each in its way, is softer than each."""
+    truth = noise()
+    maps = maps_of(PLACES, truth)
+    places = [decode_uv(uv) + bent(seed, HEIGHT, WIDTH).view(-1, 2) / SIDE for seed, uv in enumerate(maps.uv)]
+    color = torch.stack([sampled(truth, place) for place in places])
+    maps = replace(maps, color=(color * 255).round().to(torch.uint8))
+    middles = (torch.stack(torch.meshgrid(torch.arange(SIDE), torch.arange(SIDE), indexing="xy"), -1) + 0.5) / SIDE
+    start = sampled(truth, (middles + bent(9, SIDE, SIDE) / SIDE).view(-1, 2)).view(SIDE, SIDE, 3)
+    strengths = []
+    for power in (shared_detail.RAISED, 0.0):
+        monkeypatch.setattr(shared_detail, "RAISED", power)
+        found = share_detail(start, maps, share)
+        assert error(found[:, :22], start[:, :22]) < 0.01
+        strengths.append(float(found[INNER, 33:45].diff(dim=0).abs().mean()))
+    true = float(truth[INNER, 33:45].diff(dim=0).abs().mean())
+    assert strengths[1] < 0.95 * true < strengths[0]
 
 
 def test_photographs_that_are_a_pixel_off_are_moved_onto_the_render() -> None:
@@ -107,7 +135,8 @@ def test_texels_that_no_view_samples_stay() -> None:
     assert not torch.equal(found[30:40, 20:30], start[30:40, 20:30])
 
 
-def test_half_of_the_correction_is_half_of_it() -> None:
+def test_half_of_the_correction_is_half_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shared_detail, "RAISED", 0.0)  # which makes up for the other half
     truth = noise()
     start, maps = from_first(truth), grainy(maps_of(PLACES, truth))
     whole, half = share_detail(start, maps), share_detail(start, maps, 0.5)

@@ -6,7 +6,8 @@ are off. So each is first moved onto the texture's render by a smooth displaceme
 fine), and then counts by how well its detail correlates with the render's: blurred, hidden, sheen or elsewhere, it
 counts as nothing, and a place that no other photograph agrees about keeps its one. Means of several photographs, as
 multi-frame super-resolution takes them (Irani and Peleg 1991), but of the finest band alone: what is wider, tones and
-leveling have decided.
+leveling have decided. A mean of what agrees only in part is softer than each of it, so photographs' detail is raised by
+the more, the less they agree; but for grain, which a mean is to lose.
 """
 
 from __future__ import annotations
@@ -28,6 +29,12 @@ that are moved to be compared are softer."""
 BAND = 2  # pixels to each side; what is wider than such a window is no detail
 WINDOW = 7  # pixels to each side, over which detail is correlated
 POWER = 8  # of the correlation: what agrees by three quarters counts a tenth
+NOISE = 1e-4
+"""Variance of detail, of colors in [0, 1], that may be grain: what has hardly more counts little."""
+CALM, SAMPLES = 0.02, 50_000  # share of the windows that differ by grain alone, and pixels that tell
+RAISED, MOST_RAISED = 1.25, 2.0
+"""Detail is raised by 1/correlation to this power, grain left out, and by so much at the most; to twice the power where
+half of it is given: then it makes up for the other half, too."""
 LEAST = 0.01  # what counts less is left out: two pixels of three, and a hundredth of all that counts
 OCTAVES, ROUNDS = 3, 2  # of the displacement: pictures of half the size each, and steps in each
 REACH = 12  # pixels to each side, over which it is one
@@ -57,7 +64,7 @@ def share_detail(texture: Tensor, maps: ViewMaps, share: float = 1.0) -> Tensor:
     areas = shows_areas(maps)
 
     def agreed(view: int) -> tuple[Tensor, Tensor, Tensor]:
-        return _agreed_detail(values, maps.only(view), areas=areas)
+        return _agreed_detail(values, maps.only(view), areas=areas, power=RAISED / share)
 
     # One view after the other takes two cores half as long again as a view on each. On a GPU there is nothing to gain.
     at_once = 1
@@ -73,8 +80,11 @@ def share_detail(texture: Tensor, maps: ViewMaps, share: float = 1.0) -> Tensor:
     return texture.masked_scatter(owned[..., None], values)
 
 
-def _agreed_detail(values: Tensor, view: ViewMaps, *, areas: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """What the render lacks of P pixels of a view: slots [P*K], how much each counts there [P,K], detail [3,P]."""
+def _agreed_detail(values: Tensor, view: ViewMaps, *, areas: bool, power: float) -> tuple[Tensor, Tensor, Tensor]:
+    """What the render lacks of P pixels of a view: slots [P*K], how much each counts there [P,K], detail [3,P].
+
+    power: of 1/correlation, that the photograph's detail is raised by.
+    """
     size = (view.height, view.width)
     seen = view.depth.view(size) > 0
     slots, shares = _footprints(view.uv.view(*size, 2), seen, view.slot_map, areas=areas)
@@ -87,11 +97,14 @@ def _agreed_detail(values: Tensor, view: ViewMaps, *, areas: bool) -> tuple[Tens
     moved = displacement(ours, theirs, known)
     photograph = _sampled(photograph, moved, "bicubic")
     known = known * (_sampled(known[None], moved, "bilinear")[0] > INSIDE)
-    theirs = torch.tensordot(luma, photograph, 1)
-    detail = _band(torch.cat((photograph - render, ours[None], theirs[None])), known, BAND)
-    agreed = (_correlation(detail[3], detail[4], known) ** POWER * known).flatten()
-    counted = (agreed > LEAST).nonzero()[:, 0]
-    return slots[counted].long().flatten(), shares[counted] * agreed[counted, None], detail[:3].flatten(1)[:, counted]
+    bands = _band(torch.cat((render, photograph)), known, BAND).view(2, 3, *size)
+    ours, theirs = torch.tensordot(bands, luma, ([1], [0]))
+    agreement, without_grain = _correlations(ours, theirs, known)
+    counts = (agreement.pow_(POWER) * known).flatten()
+    counted = (counts > LEAST).nonzero()[:, 0]
+    raised = without_grain.flatten()[counted].pow_(-power).clamp_(max=MOST_RAISED)
+    render, photograph = bands.flatten(2)[:, :, counted]
+    return slots[counted].long().flatten(), shares[counted] * counts[counted, None], raised * photograph - render
 
 
 def _footprints(uv: Tensor, seen: Tensor, slot_map: Tensor, *, areas: bool) -> tuple[Tensor, Tensor]:
@@ -154,11 +167,19 @@ def _inverse_sums(known: Tensor, reach: int) -> Tensor:
     return window_sums(known[None], reach)[0].clamp(min=1).reciprocal()
 
 
-def _correlation(ours: Tensor, theirs: Tensor, known: Tensor) -> Tensor:
-    """[h,w] in [0,1], of two bands [h,w] over windows."""
+def _correlations(ours: Tensor, theirs: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+    """Of two bands [h,w] over windows, each [h,w] in [0,1]: as they are, and as they were without their grain.
+
+    Of the first, windows with hardly more than grain have little.
+    """
     products = _means(torch.stack((ours * ours, theirs * theirs, ours * theirs)), known, WINDOW)
-    variances = products[:2].clamp(min=0) + FAINT
-    return (products[2] / (variances[0] * variances[1]).sqrt()).clamp(0, 1)
+    variances, product = products[:2].clamp(min=0), products[2].clamp(min=0)
+    differing = (variances.sum(0) - 2 * product)[known > 0]
+    differing = differing[:: len(differing) // SAMPLES + 1]
+    grain = torch.quantile(differing, CALM) / 2 if len(differing) else 0.0
+    without = (variances - grain).clamp(min=FAINT)
+    as_is, of_detail = (product / of.prod(0).sqrt() for of in (variances + NOISE, without))
+    return as_is, of_detail.clamp(max=1)
 
 
 def _band(planes: Tensor, known: Tensor, reach: int) -> Tensor:

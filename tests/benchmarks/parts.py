@@ -110,6 +110,9 @@ VARIANTS = {
         prepared={"advtex_engine.render.view_maps.UNMEASURED": 0.0, "advtex_engine.render.view_maps.ALWAYS_READ": 0.0},
     ),
     "view selection": Variant("view_selection"),
+    "view selection, without motion": Variant(
+        "view_selection", code={"advtex_engine.methods.gabor.start_motions": lambda *_, **__: {}}
+    ),
     "the whole": Variant(),
     "without refined cameras": Variant(refine=False),
     "without refined cameras and without alignment": Variant(refine=False, changes={"alignment": False}),

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -55,23 +56,32 @@ def gabor_filters(device: torch.device) -> Tensor:
     return torch.stack(filters)[:, None].to(device, torch.float32)
 
 
-def gabor_loss(render: Tensor, photograph: Tensor, foreground: Tensor, filters: Tensor) -> Tensor:
+def gabor_loss(
+    render: Tensor,
+    photograph: Tensor,
+    foreground: Tensor,
+    filters: Tensor,
+    moved: Callable[[Tensor], Tensor] | None = None,
+) -> Tensor:
     """0-dim: squared distance of the shares of energy, mean over windows, sum over octaves; a gradient for the render.
 
     render, photograph: [1,3,h,w] in [-1,1]; the render counts where foreground [1,1,h,w] is not 0, and is the
-    photograph elsewhere. filters: of `gabor_filters`, on their device. Octaves that are smaller than a window are left
-    out.
+    photograph elsewhere. filters: of `gabor_filters`, on their device. moved: what the camera's motion makes of gray
+    levels [1,h,w], if it moved. Octaves that are smaller than a window are left out.
     """
     matrix = _placed(filters)
     with torch.no_grad():
-        gray = _gray(photograph)
+        gray = gray_levels(photograph)
         named = _shares(gray, matrix)
-    shown = _shares(torch.where(foreground[:, 0] > 0, _gray(render), gray), matrix)
+    ours = torch.where(foreground[:, 0] > 0, gray_levels(render), gray)
+    if moved is not None:
+        ours = torch.where(foreground[:, 0] > 0, moved(ours), gray)
+    shown = _shares(ours, matrix)
     distances = [F.mse_loss(ours, theirs) for ours, theirs in zip(shown, named, strict=True)]
     return ORIENTATIONS * torch.stack(distances).sum() if distances else torch.zeros((), device=render.device)
 
 
-def _gray(image: Tensor) -> Tensor:
+def gray_levels(image: Tensor) -> Tensor:
     """[1,3,h,w] in [-1,1] -> [1,h,w], with differences as of colors in [0,1]."""
     # Filled on the device: a list of numbers would have to be copied there, which a captured step must not do.
     weights = torch.cat([image.new_full((1,), part / 2) for part in LUMA])

@@ -19,7 +19,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from advtex_engine.adversarial.gabor import gabor_filters, gabor_loss
+from advtex_engine.adversarial.gabor import gabor_filters, gabor_loss, gray_levels
 from advtex_engine.adversarial.optimizer import crop_size
 from advtex_engine.adversarial.probes import LeftOutCells
 from advtex_engine.adversarial.unlikeness import structure_unlikeness
@@ -27,11 +27,12 @@ from advtex_engine.core.errors import Problem
 from advtex_engine.methods.descent import descend, drawn_views
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.methods.selected import with_detail
+from advtex_engine.render.motion import Taps, found_motion, smeared
 from advtex_engine.render.sharpness import shows_areas
 from advtex_engine.render.texture import footprints, sample_texels
-from advtex_engine.render.view_maps import ViewMaps
+from advtex_engine.render.view_maps import ViewMaps, foregrounds
 from advtex_engine.runtime.checkpoint import CHECKPOINT
-from advtex_engine.runtime.threads import side_by_side
+from advtex_engine.runtime.threads import in_threads, one_thread_each, side_by_side
 from advtex_engine.selection.shared_detail import OPTIMIZED, share_detail
 
 PASSES = 5  # over all views, unless the number of steps is asked for
@@ -80,6 +81,7 @@ def descended(
     filters = gabor_filters(device)
 
     into = [torch.empty((maps.slots, 3), device=device) for _ in range(TOGETHER)]
+    motions = start_motions(given.start, maps, areas=areas) if given.start is not None else {}
 
     def unlikeness(values: Tensor, number: int) -> tuple[Tensor, Tensor]:
         values = values.detach().requires_grad_(True)
@@ -88,7 +90,8 @@ def descended(
         )
         render = sample_texels(values, slots, weights, into[number % TOGETHER])
         render = render.view(1, height, width, 3).permute(0, 3, 1, 2) * 2 - 1
-        value = gabor_loss(render, photograph, foreground, filters) + wide_loss(render, photograph, foreground)
+        moved = partial(smeared, taps=motions.get(order[number], ()))
+        value = gabor_loss(render, photograph, foreground, filters, moved) + wide_loss(render, photograph, foreground)
         (slope,) = torch.autograd.grad(value, [values])
         return value.detach(), slope
 
@@ -107,7 +110,24 @@ def descended(
         steps = math.ceil(len(order) / TOGETHER)
         texture, losses = descend(given, "gabor", gradient, steps, generator, rate=rate, checkpoint=checkpoint)
     # Energies say how much detail there is, and not where.
-    return share_detail(texture, maps, OPTIMIZED), losses
+    return share_detail(texture, maps, OPTIMIZED, motions), losses
+
+
+def start_motions(start: Tensor, maps: ViewMaps, *, areas: bool) -> dict[int, Taps]:
+    """Of each view that shows the mesh, by how much more motion its photograph is blurred than the start [H,W,3]."""
+    values = start[maps.slot_map >= 0]
+    views = foregrounds(maps).nonzero().flatten().tolist()
+
+    def motion(number: int) -> Taps:
+        photograph, foreground, slots, weights = _seen(
+            maps.only(number), [0, 0], (maps.width, maps.height), areas=areas
+        )
+        render = sample_texels(values, slots, weights).view(1, maps.height, maps.width, 3).permute(0, 3, 1, 2) * 2 - 1
+        return found_motion(gray_levels(render)[0], gray_levels(photograph)[0], foreground[0, 0])
+
+    with one_thread_each():
+        found = list(in_threads(motion, views, TOGETHER if maps.device.type == "cpu" else 1))
+    return dict(zip(views, found, strict=True))
 
 
 def start_unlikeness(given: MethodInput) -> float:

@@ -27,7 +27,6 @@ No correction reads a pixel outside of those that count, and none touches those 
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -41,6 +40,7 @@ from advtex_engine.metrics.image_metrics import gradient_magnitude, luminance
 from advtex_engine.metrics.lpips import Lpips
 from advtex_engine.metrics.photograph import Photograph
 from advtex_engine.refine.exposure import BRIGHT, DARK, GAIN_RANGE, ROBUST_SCALE
+from advtex_engine.render.motion import motion_kernel, motions
 from advtex_engine.render.texture import fill_holes
 from advtex_engine.selection.toning import LARGEST, REACH
 
@@ -67,10 +67,6 @@ FLOW_REACH = 1 / 80
 """Of the view's width, the standard deviation of the flow's smoothing."""
 INSIDE = 0.999
 """Share of a sample of the render that must lie on pixels that count."""
-MOTION_PIXELS = (1.75, 2.5, 3.5, 5.0, 7.0, 10.0)
-MOTION_ANGLES = 12
-ACROSS = 0.2
-"""Pixels, the deviation of a motion's blur across it: thin, so that the directions beside it keep their energies."""
 DIRECTIONS = 6
 """Along which gradients are compared, to find a motion."""
 
@@ -182,9 +178,7 @@ def own_motion(image: Tensor, photo: Tensor, known: Tensor) -> tuple[float, floa
         energies = _gradient_energies(_smeared(ours, pixels, angle), inside)
         return float(np.square(np.log((energies + 1e-6) / (wanted + 1e-6))).sum())
 
-    angles = [math.pi * number / MOTION_ANGLES for number in range(MOTION_ANGLES)]
-    motions = [(0.0, 0.0), *itertools.product(MOTION_PIXELS, angles)]
-    return min(motions, key=lambda motion: unlike(*motion))
+    return min(motions(), key=lambda motion: unlike(*motion))
 
 
 def _gradient_energies(gray: Array, inside: Mask) -> Array:
@@ -213,13 +207,8 @@ def _smeared(picture: Array, pixels: float, angle: float) -> Array:
     """Means along a line, with the weights of a Gaussian as wide as the line: motions are no uniform ones."""
     if pixels == 0:
         return picture
-    deviation = pixels / 12**0.5
-    reach = math.ceil(3 * deviation)
-    steps = np.arange(-reach, reach + 1)
-    x, y = np.meshgrid(steps, steps)
-    along, beside = x * math.cos(angle) + y * math.sin(angle), y * math.cos(angle) - x * math.sin(angle)
-    kernel = np.exp(-((along / deviation) ** 2 + (beside / ACROSS) ** 2) / 2)
-    smeared: Array = cv2.filter2D(picture, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
+    kernel = motion_kernel(pixels, angle).numpy()
+    smeared: Array = cv2.filter2D(picture, -1, kernel, borderType=cv2.BORDER_REPLICATE)
     return smeared
 
 

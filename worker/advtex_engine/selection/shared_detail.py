@@ -12,11 +12,14 @@ the more, the less they agree; but for grain, which a mean is to lose.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from advtex_engine.render.filtering import halved, window_sums
+from advtex_engine.render.motion import Taps, smeared
 from advtex_engine.render.sharpness import shows_areas
 from advtex_engine.render.texture import footprints, sample_texels
 from advtex_engine.render.view_maps import ViewMaps, foregrounds
@@ -50,11 +53,14 @@ BYTES_PER_PIXEL = 300  # of a view, while it is compared
 LUMA = (0.299, 0.587, 0.114)
 
 
-def share_detail(texture: Tensor, maps: ViewMaps, share: float = 1.0) -> Tensor:
+def share_detail(
+    texture: Tensor, maps: ViewMaps, share: float = 1.0, motions: Mapping[int, Taps] | None = None
+) -> Tensor:
     """The texture [H,W,3] float32 in [0,1] with the finest detail that the views at working size have in common.
 
     texture: without holes; texels that no view samples stay as they are. share: of the correction that is made; the
-    rest of the texture's own detail stays. Not differentiable.
+    rest of the texture's own detail stays. motions: of views whose cameras moved; what their photographs lack by that
+    is not taken away. Not differentiable.
     """
     assert texture.shape[:2] == maps.slot_map.shape
     owned = maps.slot_map >= 0
@@ -64,7 +70,9 @@ def share_detail(texture: Tensor, maps: ViewMaps, share: float = 1.0) -> Tensor:
     areas = shows_areas(maps)
 
     def agreed(view: int) -> tuple[Tensor, Tensor, Tensor]:
-        return _agreed_detail(values, maps.only(view), areas=areas, power=RAISED / share)
+        return _agreed_detail(
+            values, maps.only(view), areas=areas, power=RAISED / share, motion=(motions or {}).get(view, ())
+        )
 
     # One view after the other takes two cores half as long again as a view on each. On a GPU there is nothing to gain.
     at_once = 1
@@ -80,7 +88,9 @@ def share_detail(texture: Tensor, maps: ViewMaps, share: float = 1.0) -> Tensor:
     return texture.masked_scatter(owned[..., None], values)
 
 
-def _agreed_detail(values: Tensor, view: ViewMaps, *, areas: bool, power: float) -> tuple[Tensor, Tensor, Tensor]:
+def _agreed_detail(
+    values: Tensor, view: ViewMaps, *, areas: bool, power: float, motion: Taps
+) -> tuple[Tensor, Tensor, Tensor]:
     """What the render lacks of P pixels of a view: slots [P*K], how much each counts there [P,K], detail [3,P].
 
     power: of 1/correlation, that the photograph's detail is raised by.
@@ -97,7 +107,7 @@ def _agreed_detail(values: Tensor, view: ViewMaps, *, areas: bool, power: float)
     moved = displacement(ours, theirs, known)
     photograph = _sampled(photograph, moved, "bicubic")
     known = known * (_sampled(known[None], moved, "bilinear")[0] > INSIDE)
-    bands = _band(torch.cat((render, photograph)), known, BAND).view(2, 3, *size)
+    bands = _band(torch.cat((smeared(render, motion), photograph)), known, BAND).view(2, 3, *size)
     ours, theirs = torch.tensordot(bands, luma, ([1], [0]))
     agreement, without_grain = _correlations(ours, theirs, known)
     counts = (agreement.pow_(POWER) * known).flatten()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import cv2
 import numpy as np
@@ -24,6 +25,7 @@ from advtex_engine.adversarial.gabor import (
     gabor_loss,
     window_reach,
 )
+from advtex_engine.render.motion import smeared
 
 FILTERS = gabor_filters(torch.device("cpu"))
 
@@ -186,3 +188,17 @@ def test_a_texture_of_views_that_disagree_is_sharper_for_it() -> None:
             adam.step()
         strengths.append(float(image.detach()[:, :1].diff(dim=-1).abs().mean()))
     assert strengths[1] > 1.1 * strengths[0]
+
+
+def test_before_a_photograph_that_moved_a_sharp_render_is_the_best() -> None:
+    sharp = texture(0)
+    motion = ((0, -1, 0.3), (0, 0, 0.4), (0, 1, 0.3))
+    photograph = shown(smeared(torch.from_numpy(sharp)[None].float(), motion)[0].numpy())
+    foreground = torch.ones_like(photograph[:, :1])
+    foreground[..., :20] = 0
+    losses = [
+        [float(gabor_loss(render, photograph, foreground, FILTERS, moved)) for render in (shown(sharp), photograph)]
+        for moved in (partial(smeared, taps=motion), None)
+    ]
+    assert losses[0][0] < 0.1 * losses[0][1]
+    assert losses[1][0] > 10 * losses[1][1]

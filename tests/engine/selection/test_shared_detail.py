@@ -12,6 +12,7 @@ from plane import HEIGHT, SIDE, WIDTH, blurred, maps_of, noise, sampled
 from torch import Tensor
 
 from advtex_engine.render.filtering import blurred as gaussian
+from advtex_engine.render.motion import smeared
 from advtex_engine.render.texture import decode_uv, number_slots, sample_texels
 from advtex_engine.render.view_maps import ViewMaps
 from advtex_engine.selection import shared_detail
@@ -79,6 +80,20 @@ def test_detail_is_as_strong_where_photographs_agree_in_part(share: float, monke
         strengths.append(float(found[INNER, 33:45].diff(dim=0).abs().mean()))
     true = float(truth[INNER, 33:45].diff(dim=0).abs().mean())
     assert strengths[1] < 0.95 * true < strengths[0]
+
+
+def test_what_a_moved_photograph_lacks_is_not_taken_away() -> None:
+    truth = noise()
+    motion = ((0, -1, 0.25), (0, 0, 0.5), (0, 1, 0.25))
+    sharp = maps_of(PLACES, truth)
+    size = (len(PLACES), HEIGHT, WIDTH, 3)
+    moved = [smeared(color.permute(2, 0, 1).float(), motion) for color in sharp.color.view(size)]
+    color = torch.stack(moved).permute(0, 2, 3, 1).round().to(torch.uint8)
+    maps = replace(sharp, color=color.view(sharp.color.shape))
+    errors = [
+        error(share_detail(truth, maps, 0.5, motions), truth) for motions in (None, dict.fromkeys(range(5), motion))
+    ]
+    assert errors[1] < 0.7 * errors[0]
 
 
 def test_photographs_that_are_a_pixel_off_are_moved_onto_the_render() -> None:

@@ -38,6 +38,8 @@ from advtex_engine.render.pairs import own_pairs
 from advtex_engine.render.rasterize import rasterize
 from advtex_engine.render.render_view import render_view
 from advtex_engine.render.texels import map_texels
+from advtex_engine.render.motion import _taps as motion_taps
+from advtex_engine.render.motion import smeared
 from advtex_engine.render.texture import sample_texels
 from advtex_engine.render.view_maps import build_view_maps
 from advtex_engine.runtime.checkpoint import WorkFolder
@@ -464,7 +466,26 @@ def test_view_selection_renders_means_over_pixels_where_photographs_are_such_mea
 
     monkeypatch.setattr(gabor, "sample_texels", sample)
     view_selection(given)
-    assert seen == [texels] * 3 * TOGETHER
+    assert seen == [texels] * (3 + 3 * TOGETHER)  # once each to find its motion, then the steps
+
+
+@pytest.mark.parametrize("found", [True, False])
+def test_photographs_that_moved_soften_nothing(found: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fine = torch.rand((1, 3, SIDE // 2, SIDE // 2), generator=torch.Generator().manual_seed(4))
+    picture = F.interpolate(fine, (SIDE, SIDE), mode="bilinear")[0].permute(1, 2, 0)
+    motion = motion_taps(25)
+    moved = smeared(picture.permute(2, 0, 1), motion).permute(1, 2, 0)
+    pictures = torch.stack([picture, *[moved] * 5])
+    maps = planar_maps((pictures * 255).round().to(torch.uint8).contiguous(), SIDE, SIDE)
+    given = task(plane(), (view("0", plane(), truth(), camera((0.5, 0.45, 1.0))),), tmp_path)
+    config = TextureConfig(method="view_selection", steps=60)
+    given = replace(given, maps={1: maps}, means={1: mean_texture(maps)}, start=picture, config=config)
+    if not found:
+        monkeypatch.setattr(gabor, "start_motions", lambda *_, **__: {})
+    texture, _ = gabor.descended(given, 60)
+    inner = slice(SIDE // 8, -SIDE // 8)
+    strength = [image[inner, inner].diff(dim=1).abs().mean() for image in (texture, picture)]
+    assert (strength[0] > 0.95 * strength[1]) == found
 
 
 def test_view_selection_takes_what_is_wide_from_all_photographs_and_keeps_detail(

@@ -34,12 +34,12 @@ from advtex_engine.methods.view_selection import view_selection
 from advtex_engine.metrics.lpips import NETWORKS, WeightsError, load_features
 from advtex_engine.pipeline import texture_scan
 from advtex_engine.previews.live import Live
+from advtex_engine.render.motion import _taps as motion_taps
+from advtex_engine.render.motion import smeared
 from advtex_engine.render.pairs import own_pairs
 from advtex_engine.render.rasterize import rasterize
 from advtex_engine.render.render_view import render_view
 from advtex_engine.render.texels import map_texels
-from advtex_engine.render.motion import _taps as motion_taps
-from advtex_engine.render.motion import smeared
 from advtex_engine.render.texture import sample_texels
 from advtex_engine.render.view_maps import build_view_maps
 from advtex_engine.runtime.checkpoint import WorkFolder
@@ -533,7 +533,7 @@ def test_half_of_an_optimized_texture_s_finest_detail_is_what_photographs_share(
     monkeypatch.setattr(
         importlib.import_module(f"advtex_engine.methods.{module}"),
         "share_detail",
-        lambda texture, _, share: asked.append((texture, share)) or texture / 2,
+        lambda texture, _, share, *__: asked.append((texture, share)) or texture / 2,
     )
     texture, _ = texture_function(method)(replace(given, preset=replace(given.preset, turn=0, start="selection")))
     ((before, share),) = asked

@@ -5,7 +5,8 @@ forgive some pixels, so that every view adds to a texture that begins as a patch
 nothing of colors, and nothing of what is wider than their coarsest octave: there means over blocks are compared, which
 some pixels of displacement hardly change either. The render's pixels are means over what they show, where a
 photograph's are: values at their middles would make a texture that is as soft as these means, and softer still when it
-is shown. At the end half of the finest detail is that of all photographs that agree (`selection/shared_detail.py`).
+is shown. A photograph whose camera moved is compared with a render that is smeared as it is (`render/motion.py`). At
+the end half of the finest detail is that of all photographs that agree (`selection/shared_detail.py`).
 
 What forgives some pixels has nothing to say where photographs are off by many more, as with cameras that nothing could
 mend. There the texture stays as it is: photographs that it was not painted from do not look like it at all.

@@ -131,7 +131,7 @@ def _energies_after(right: Tensor, down: Tensor, inside: Tensor) -> Tensor:
     """
     weights = _kernels_correlated().to(right)
     lag = math.isqrt(weights.shape[1]) // 2
-    size = [side + lag for side in right.shape]
+    size = [_fast(side + lag) for side in right.shape]
     spectra = [torch.fft.rfft2(plane, s=size) for plane in (right, down, inside.to(right))]
     powers = torch.stack([(a.conj() * b).real for a, b in (*_pairs(*spectra[:2]), (spectra[2], spectra[2]))])
     correlated = torch.fft.irfft2(powers, s=size).roll((lag, lag), (-2, -1))[:, : 2 * lag + 1, : 2 * lag + 1]
@@ -139,6 +139,16 @@ def _energies_after(right: Tensor, down: Tensor, inside: Tensor) -> Tensor:
     share = number / number[len(number) // 2].clamp(min=1)
     found: Tensor = (torch.stack(products) / share.clamp(min=LEAST_SHARE)) @ weights.T
     return found
+
+
+@cache
+def _fast(side: int) -> int:
+    """The next length without large factors: with them a transform takes twice as long."""
+    rest = side
+    for factor in (2, 3, 5, 7, 11):
+        while rest % factor == 0:
+            rest //= factor
+    return side if rest == 1 else _fast(side + 1)
 
 
 @cache

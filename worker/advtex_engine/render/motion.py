@@ -156,11 +156,9 @@ def _kernels_correlated() -> Tensor:
     """[motions,(2L+1)^2] float32: each kernel's correlation with itself."""
     kernels = [motion_kernel(*motion) for motion in motions()]
     side = 2 * max(len(kernel) for kernel in kernels) - 1
-    found = []
-    for kernel in kernels:
-        own = F.conv2d(kernel[None, None], kernel[None, None], padding=len(kernel) - 1)[0, 0]
-        found.append(F.pad(own, ((side - len(own)) // 2,) * 4).flatten())
-    return torch.stack(found).to(torch.float32)
+    spectra = torch.stack([torch.fft.rfft2(kernel, s=(side, side)) for kernel in kernels])
+    found = torch.fft.irfft2(spectra.abs().square(), s=(side, side)).roll((side // 2,) * 2, (1, 2))
+    return found.flatten(1).to(torch.float32)
 
 
 @cache

@@ -157,7 +157,7 @@ def _kernels_correlated() -> Tensor:
     kernels = [motion_kernel(*motion) for motion in motions()]
     side = 2 * max(len(kernel) for kernel in kernels) - 1
     spectra = torch.stack([torch.fft.rfft2(kernel, s=(side, side)) for kernel in kernels])
-    found = torch.fft.irfft2(spectra.abs().square(), s=(side, side)).roll((side // 2,) * 2, (1, 2))
+    found: Tensor = torch.fft.irfft2(spectra.abs().square(), s=(side, side)).roll((side // 2,) * 2, (1, 2))
     return found.flatten(1).to(torch.float32)
 
 

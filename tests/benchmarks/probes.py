@@ -45,6 +45,7 @@ from advtex_engine.adversarial.unlikeness import Unlikeness, structure_unlikenes
 from advtex_engine.core.config import PRESETS, Preset, TextureConfig, resolve_preset
 from advtex_engine.methods import MethodInput
 from advtex_engine.methods.adversarial import fitted, pairs_of
+from advtex_engine.methods.gabor import start_motions
 from advtex_engine.methods.mean import dense_texture
 from advtex_engine.metrics.evaluate import score_views
 from advtex_engine.metrics.lpips import Lpips
@@ -104,9 +105,10 @@ def play(given: MethodInput, lpips: Lpips, score: Score, results: Results, setti
         optimizer.sampler.source_count.fill_(views.leave_out(left_out))
 
     measures: dict[str, Unlikeness] = {"LPIPS": lpips.to(maps.device).maps, "structure": structure_unlikeness}
+    motions = start_motions(start, maps, areas=optimizer.preset.areas)
     judges = {
         name: Probes(
-            LeftOutCells(maps, painted, measure, areas=optimizer.preset.areas),
+            LeftOutCells(maps, painted, measure, areas=optimizer.preset.areas, motions=motions),
             sources,
             leave_out,  # twice the same
             judged_by=name,

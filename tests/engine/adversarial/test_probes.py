@@ -14,6 +14,7 @@ from advtex_engine.adversarial.optimizer import AdversarialOptimizer
 from advtex_engine.adversarial.probes import CELLS, LEAST_VIEWS, PARTS, LeftOutCells, Probes, Turns, probed
 from advtex_engine.adversarial.unlikeness import structure_unlikeness
 from advtex_engine.core.config import PRESETS
+from advtex_engine.render.motion import smeared
 from advtex_engine.render.streaming import ResidentViews
 from advtex_engine.render.view_maps import ViewMaps
 from advtex_engine.synthetic.planar import planar_maps, planar_pairs
@@ -78,6 +79,21 @@ def test_only_what_another_view_has_painted_is_judged() -> None:
         assert torch.equal(shown[0][:, ~judged], photo[0][:, ~judged]), "nothing else is told of"
         by_hand = (picture().float() / 255 - 0.5).abs().mean(2)[judged].mean()
         assert unlike == pytest.approx(float(by_hand), abs=1e-4)
+
+
+def test_a_soft_texture_is_not_nearer_to_photographs_that_moved() -> None:
+    """It is the less like them, the softer it is, and one that is as sharp as what they were taken of is exact."""
+    sharp, motion = same_views(), tuple((0, right, 0.2) for right in range(-2, 3))
+    moved = smeared(picture().permute(2, 0, 1).float(), motion).permute(1, 2, 0)
+    maps = planar_maps(moved.round().to(torch.uint8).expand(VIEWS, -1, -1, -1).contiguous(), SIZE, SIZE)
+    soft = maps.color[0][maps.slot_map.flatten() >= 0].float() / 255
+    unlike = []
+    for motions in (None, dict.fromkeys(range(VIEWS), motion)):
+        cells = LeftOutCells(maps, quarters(), structure_unlikeness, motions=motions)
+        some = cells.of([0, 1, 5])
+        unlike.append([cells.unlike(some, values) for values in (exact(sharp), soft)])
+    assert unlike[0][1] < 0.1 * unlike[0][0]
+    assert unlike[1][0] < 0.1 * unlike[1][1]
 
 
 def test_chance_is_how_unlike_unrelated_pictures_are() -> None:

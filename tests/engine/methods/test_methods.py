@@ -8,6 +8,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,8 @@ from advtex_engine import methods
 from advtex_engine.adversarial.disagreement import disagreement
 from advtex_engine.adversarial.discriminator import PatchDiscriminator
 from advtex_engine.adversarial.optimizer import AdversarialOptimizer, crop_size
-from advtex_engine.core.config import PRINTED, PyramidLevel, TextureConfig
+from advtex_engine.adversarial.probes import LeftOutCells
+from advtex_engine.core.config import PRESETS, PRINTED, PyramidLevel, TextureConfig
 from advtex_engine.core.errors import EngineError, Problem, Stopped
 from advtex_engine.core.monitor import Monitor
 from advtex_engine.core.scene import Atlas, Camera, Mesh, Scene, View
@@ -34,14 +36,14 @@ from advtex_engine.methods.view_selection import view_selection
 from advtex_engine.metrics.lpips import NETWORKS, WeightsError, load_features
 from advtex_engine.pipeline import texture_scan
 from advtex_engine.previews.live import Live
+from advtex_engine.render.motion import Taps, smeared
 from advtex_engine.render.motion import _taps as motion_taps
-from advtex_engine.render.motion import smeared
 from advtex_engine.render.pairs import own_pairs
 from advtex_engine.render.rasterize import rasterize
 from advtex_engine.render.render_view import render_view
 from advtex_engine.render.texels import map_texels
 from advtex_engine.render.texture import sample_texels
-from advtex_engine.render.view_maps import build_view_maps
+from advtex_engine.render.view_maps import ViewMaps, build_view_maps
 from advtex_engine.runtime.checkpoint import WorkFolder
 from advtex_engine.runtime.threads import threads_each
 from advtex_engine.selection import shared_detail
@@ -486,6 +488,44 @@ def test_photographs_that_moved_soften_nothing(found: bool, tmp_path: Path, monk
     inner = slice(SIDE // 8, -SIDE // 8)
     strength = [image[inner, inner].diff(dim=1).abs().mean() for image in (texture, picture)]
     assert (strength[0] > 0.95 * strength[1]) == found
+
+
+def test_what_the_game_is_judged_by_and_ends_with_knows_of_motion(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fine = torch.rand((1, 3, SIDE // 2, SIDE // 2), generator=torch.Generator().manual_seed(4))
+    picture = F.interpolate(fine, (SIDE, SIDE), mode="bilinear")[0].permute(1, 2, 0)
+    motion = motion_taps(25)
+    moved = smeared(picture.permute(2, 0, 1), motion).permute(1, 2, 0)
+    pictures = torch.stack([picture, *[moved] * 5])
+    maps = planar_maps((pictures * 255).round().to(torch.uint8).contiguous(), SIDE, SIDE)
+    given = task(plane(), (view("0", plane(), truth(), camera((0.5, 0.45, 1.0))),), tmp_path)
+    preset = replace(PRESETS["standard"], levels=(PyramidLevel(20),), pretraining=0, averaging=5, turn=10, patience=9)
+    given = replace(given, maps={1: maps}, means={1: mean_texture(maps)}, start=picture, preset=preset)
+    given = replace(given, painted=torch.zeros((SIDE, SIDE), dtype=torch.int16))
+    told: list[Mapping[int, Taps]] = []
+
+    class Cells(LeftOutCells):
+        def __init__(self, *args: Any, motions: Mapping[int, Taps], **others: Any) -> None:
+            told.append(motions)
+            super().__init__(*args, motions=motions, **others)
+
+        def unlike(self, *_: object) -> float:
+            return next(less)  # so that the start is not kept
+
+    less = iter(range(20, 0, -1))
+
+    def share(texture: Tensor, _maps: ViewMaps, _share: float, motions: Mapping[int, Taps]) -> Tensor:
+        told.append(motions)
+        return texture
+
+    module = importlib.import_module("advtex_engine.methods.adversarial")
+    monkeypatch.setattr(module, "LeftOutCells", Cells)
+    monkeypatch.setattr(module, "share_detail", share)
+    module.adversarial(given)
+    assert len(told) == 2
+    for motions in told:
+        assert motions == {0: (), **dict.fromkeys(range(1, 6), motion)}
 
 
 def test_view_selection_takes_what_is_wide_from_all_photographs_and_keeps_detail(

@@ -13,7 +13,7 @@ between two launches. Only a look waits for the device.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
@@ -22,6 +22,7 @@ from torch import Tensor
 
 from advtex_engine.adversarial.unlikeness import Unlikeness
 from advtex_engine.core.scene import evenly_spread
+from advtex_engine.render.motion import Taps, smeared
 from advtex_engine.render.texture import footprints, sample_texels
 from advtex_engine.render.view_maps import ViewMaps
 from advtex_engine.runtime.threads import in_threads, one_thread_each
@@ -81,23 +82,34 @@ class Turns:
 
 @dataclass(frozen=True)
 class _Cells:
-    """N cells of a left-out view: photograph [N,3,h,w] in [0,1], judged [N,h,w] bool, `footprints` [N*h*w,K]."""
+    """N cells of a left-out view: photograph [N,3,h,w] in [0,1], judged [N,h,w] bool, `footprints` [N*h*w,K], and the
+    motion of its camera."""
 
     photograph: Tensor
     judged: Tensor
     slots: Tensor
     weights: Tensor
+    motion: Taps
 
 
 class LeftOutCells:
     """Cells of views, and how unlike a texture is to them.
 
     maps: of all views, wherever their pixels are. painted: [H,W] int16 of the start's own size, the view that each
-    texel was painted from, -1 = none. areas: as of the `PairSampler`.
+    texel was painted from, -1 = none. areas: as of the `PairSampler`. motions: of views whose cameras moved, put onto
+    what is compared with their photographs, to which a softer texture would seem nearer.
     """
 
-    def __init__(self, maps: ViewMaps, painted: Tensor, unlikeness: Unlikeness, *, areas: bool = False) -> None:
-        self.maps, self.unlikeness, self.areas = maps, unlikeness, areas
+    def __init__(
+        self,
+        maps: ViewMaps,
+        painted: Tensor,
+        unlikeness: Unlikeness,
+        *,
+        areas: bool = False,
+        motions: Mapping[int, Taps] | None = None,
+    ) -> None:
+        self.maps, self.unlikeness, self.areas, self.motions = maps, unlikeness, areas, motions or {}
         self._painted = _resized(painted.to(maps.device), maps.slot_map.shape)[maps.slot_map >= 0]
         self.width, self.height = min(CELL, maps.width), min(CELL, maps.height)
         rows, columns = (torch.arange(side, device=maps.device) for side in (self.height, self.width))
@@ -124,6 +136,9 @@ class LeftOutCells:
             shown = sample_texels(values, some.slots, some.weights).clamp(0, 1)
             shown = shown.view(*some.judged.shape, 3).permute(0, 3, 1, 2)
             shown = torch.where(some.judged[:, None], shown, some.photograph)
+            if some.motion:  # of what is judged alone: the photograph is smeared already
+                moved = smeared(shown.flatten(0, 1), some.motion).view_as(shown)
+                shown = torch.where(some.judged[:, None], moved, some.photograph)
             judged = (self.unlikeness(shown, some.photograph) * some.judged).sum(dtype=torch.float64)
             return torch.stack((judged, some.judged.sum(dtype=torch.float64)))
 
@@ -159,6 +174,7 @@ class LeftOutCells:
             judged[flat].view(shape),
             slots[flat],
             weights[flat],
+            self.motions.get(view, ()),
         )
 
 

@@ -21,6 +21,7 @@ from advtex_engine.adversarial.schedule import AVERAGE_EVERY
 from advtex_engine.adversarial.unlikeness import structure_unlikeness
 from advtex_engine.core.config import Preset
 from advtex_engine.core.errors import Diverged, Problem, Stopped
+from advtex_engine.methods.gabor import start_motions
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.methods.mean import dense_texture
 from advtex_engine.metrics.evaluate import configured_lpips
@@ -58,7 +59,9 @@ class _Run:
 def adversarial(given: MethodInput) -> tuple[Tensor, list[LossPoint]]:
     """Optimizes the texture; goes on from the work folder's checkpoint when there is one.
 
-    From view selection, the finest detail is shared at the end (`share_detail`), unless the start is kept.
+    From view selection, the finest detail is shared once more at the end (`share_detail`), unless the start is kept.
+    Cameras' motions (`start_motions`) are put onto what photographs are compared with then, and when views that are
+    left out judge the texture.
     Returns the dense texture [H,W,3] float32 in [0,1] and the loss history; what the discriminator knew is the fact
     "game", and a warning where that was no help to the texture. Raises Stopped, after a checkpoint, when
     the monitor asks for it. On a CPU the result does not depend on whether and where the run was interrupted. A run
@@ -145,7 +148,8 @@ def _optimized(
         if not helped:
             break
     if preset.start == "selection" and texture is not start:
-        texture = share_detail(texture.clamp(0, 1), given.maps[1], OPTIMIZED)
+        motions = start_motions(start, given.maps[1], areas=shows_areas(given.maps[1]))
+        texture = share_detail(texture.clamp(0, 1), given.maps[1], OPTIMIZED, motions)
     told = probed(run.probed, preset.steps)
     if told is not None:
         given.monitor.note(told["told"])
@@ -170,12 +174,14 @@ def _probes(
         return None
     lpips, _ = configured_lpips()
     unlikeness = structure_unlikeness if lpips is None else lpips.to(maps.device).maps
+    areas = optimizer.preset.areas
+    motions = start_motions(_resized(starting_texture(given), maps.slot_map.shape), maps, areas=areas)
 
     def leave_out(left_out: Tensor) -> None:
         optimizer.sampler.source_count.fill_(views.leave_out(left_out))
 
     probes = Probes(
-        LeftOutCells(maps, given.painted, unlikeness, areas=optimizer.preset.areas),
+        LeftOutCells(maps, given.painted, unlikeness, areas=areas, motions=motions),
         pairs.sources.tolist(),
         leave_out,
         judged_by="structure" if lpips is None else "LPIPS",

@@ -74,6 +74,7 @@ def cells(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
 def fill(arguments: argparse.Namespace, results: Results, lpips: Lpips) -> None:
     """Runs every cell that is not in the results yet."""
     device = choose_device(arguments.device)
+    arguments.results.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="advtex-sparsity-") as folder:
         scan = Path(folder) / "scan"
         made, used = "", (0, "")

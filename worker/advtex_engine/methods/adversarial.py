@@ -25,10 +25,12 @@ from advtex_engine.methods.gabor import start_motions
 from advtex_engine.methods.inputs import LossPoint, MethodInput
 from advtex_engine.methods.mean import dense_texture
 from advtex_engine.metrics.evaluate import configured_lpips
+from advtex_engine.render.motion import Taps
 from advtex_engine.render.pairs import Pairs, own_pairs, related_pairs
 from advtex_engine.render.sharpness import shows_areas
 from advtex_engine.render.streaming import PairViews, pair_views
 from advtex_engine.render.view_maps import ViewMaps
+from advtex_engine.runtime.available_memory import give_back_unused
 from advtex_engine.runtime.checkpoint import Checkpoints
 from advtex_engine.runtime.threads import fit_threads
 from advtex_engine.selection.shared_detail import OPTIMIZED, share_detail
@@ -108,6 +110,7 @@ def _optimized(
         run = _Run(saved["level"], saved["step"], saved["losses"], halved, saved["probed"])
         given.live.quality = saved["quality"]
     start = starting_texture(given)
+    motions = _motions(given, start)
     texture = start
     for number, level in enumerate(preset.levels):
         if number < run.level:
@@ -129,7 +132,7 @@ def _optimized(
         )
         optimizer.index = run.step
         end = sum(part.steps for part in preset.levels[: number + 1])
-        probes = _probes(given, maps, pairs, optimizer, views, end)
+        probes = _probes(given, maps, pairs, optimizer, views, end, motions.get(level.scale))
         if saved:
             optimizer.load_state_dict(saved["optimizer"])
             if probes is not None:
@@ -148,8 +151,7 @@ def _optimized(
         if not helped:
             break
     if preset.start == "selection" and texture is not start:
-        motions = start_motions(start, given.maps[1], areas=shows_areas(given.maps[1]))
-        texture = share_detail(texture.clamp(0, 1), given.maps[1], OPTIMIZED, motions)
+        texture = share_detail(texture.clamp(0, 1), given.maps[1], OPTIMIZED, motions[1])
     told = probed(run.probed, preset.steps)
     if told is not None:
         given.monitor.note(told["told"])
@@ -162,8 +164,29 @@ def _optimized(
     return texture.clamp(0, 1), losses
 
 
+def _motions(given: MethodInput, start: Tensor) -> dict[int, dict[int, Taps]]:
+    """By scale, those of its views; none from other starts than view selection's.
+
+    Before there is an optimizer, and with what that took given back: it is not in the estimate.
+    """
+    if given.preset.start != "selection":
+        return {}
+    found = {}
+    for scale in {1, *(level.scale for level in given.preset.levels)}:
+        maps = given.maps[scale]
+        found[scale] = start_motions(_resized(start, maps.slot_map.shape), maps, areas=shows_areas(maps))
+    give_back_unused()
+    return found
+
+
 def _probes(
-    given: MethodInput, maps: ViewMaps, pairs: Pairs, optimizer: AdversarialOptimizer, views: PairViews, end: int
+    given: MethodInput,
+    maps: ViewMaps,
+    pairs: Pairs,
+    optimizer: AdversarialOptimizer,
+    views: PairViews,
+    end: int,
+    motions: Mapping[int, Taps] | None,
 ) -> Probes | None:
     """What says whether the level's steps pay; None where the preset asks for none, or no view can be left out.
 
@@ -174,14 +197,12 @@ def _probes(
         return None
     lpips, _ = configured_lpips()
     unlikeness = structure_unlikeness if lpips is None else lpips.to(maps.device).maps
-    areas = optimizer.preset.areas
-    motions = start_motions(_resized(starting_texture(given), maps.slot_map.shape), maps, areas=areas)
 
     def leave_out(left_out: Tensor) -> None:
         optimizer.sampler.source_count.fill_(views.leave_out(left_out))
 
     probes = Probes(
-        LeftOutCells(maps, given.painted, unlikeness, areas=areas, motions=motions),
+        LeftOutCells(maps, given.painted, unlikeness, areas=optimizer.preset.areas, motions=motions),
         pairs.sources.tolist(),
         leave_out,
         judged_by="structure" if lpips is None else "LPIPS",
